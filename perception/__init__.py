@@ -14,7 +14,7 @@ Public names, by what they are for; each has an example:
   `perception.query.requests.Reply`, `perception.query.requests.EngineBusy`,
   `perception.query.requests.AnswerTimeout`, `perception.query.requests.EngineClosed`
 - correct it: `perception.edit.editor.Editor`, `perception.map.write.set_labels`
-- export it: `perception.export.export_map.export_map`, `perception.export.transfer.ExportOptions`,
+- export it: `perception.export.export_map.export_map`, `perception.export.export_map.ExportOptions`,
   `perception.export.mesh.export_mesh`, `perception.export.mesh.export_voxels`
 - render Gaussians: `perception.rasterize`
 - bad input: `perception.InputError`, one line that says what was found, what was expected and what to do

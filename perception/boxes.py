@@ -25,9 +25,10 @@ def oriented_box(points: np.ndarray, trim: float = 0.0) -> OrientedBox:
     each axis, against outliers; the axes are then chosen on an even sample.
     """
     points = np.asarray(points, np.float64)
-    outline = _hull(points) if trim == 0 else points[:: len(points) // SAMPLE + 1]
+    hull = None if trim else _hull(points)
+    outline = points[:: len(points) // SAMPLE + 1] if trim else points if hull is None else hull
     outline = outline[np.lexsort(outline.T)]
-    axes = np.stack(_candidates(outline))
+    axes = _candidates(outline)
     low, high = _sides(axes, outline, trim)
     extent = high - low
     # A floor of a thousandth of the longest side, so that flat instances compare by their area.
@@ -51,49 +52,36 @@ def _sides(axes: np.ndarray, points: np.ndarray, trim: float) -> tuple[np.ndarra
     return local.min(axis=1), local.max(axis=1)
 
 
-def _hull(points: np.ndarray) -> np.ndarray:
-    """The corners of the convex hull [C, 3], or all points when they lie in a plane."""
+def _hull(points: np.ndarray) -> np.ndarray | None:
+    """The corners of the convex hull of points [P, D]; None when they lie in a plane, or in 2D on a line."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:
-        return points[ConvexHull(points).vertices]
+        return np.asarray(points[ConvexHull(points).vertices])
     except (QhullError, ValueError):
-        return points
+        return None
 
 
-def _candidates(points: np.ndarray) -> list[np.ndarray]:
-    """Candidate rotations [3, 3] (rows are axes); the world axes come first."""
+def _candidates(points: np.ndarray) -> np.ndarray:
+    """Candidate rotations [C, 3, 3] (rows are axes): the world axes, then those about each that align with one of the
+    64 longest sides of the planar convex hull, then the principal axes."""
     found = [np.eye(3)]
-    if len(points) < 4:
-        return [*found, _along(points)]
-    for up in range(3):
+    for up in range(3) if len(points) >= 4 else ():
         a, b = (up + 1) % 3, (up + 2) % 3
-        for direction in _hull_directions(points[:, [a, b]]):
+        corners = _hull(points[:, [a, b]])
+        if corners is None:
+            continue
+        sides = np.roll(corners, -1, axis=0) - corners
+        length = np.linalg.norm(sides, axis=1)
+        longest = np.argsort(-length, kind="stable")[:64]
+        for direction in sides[longest] / length[longest, None]:
             axes = np.zeros((3, 3))
             axes[0, [a, b]] = direction
             axes[1, [a, b]] = [-direction[1], direction[0]]
             axes[2, up] = 1
             found.append(axes)
-    return [*found, _along(points)]
-
-
-def _along(points: np.ndarray) -> np.ndarray:
-    """Principal axes of points [P, 3]."""
-    return np.asarray(np.linalg.svd((points - points.mean(axis=0)).T @ (points - points.mean(axis=0)))[2])
-
-
-def _hull_directions(plane: np.ndarray) -> np.ndarray:
-    """Unit directions [D, 2] of the convex hull's 64 longest sides; none when the points lie on a line."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    try:
-        corners = plane[ConvexHull(plane).vertices]
-    except QhullError:
-        return np.empty((0, 2))
-    sides = np.roll(corners, -1, axis=0) - corners
-    length = np.linalg.norm(sides, axis=1)
-    longest = np.argsort(-length, kind="stable")[:64]
-    return sides[longest] / length[longest, None]
+    centred = points - points.mean(axis=0)
+    return np.stack([*found, np.linalg.svd(centred.T @ centred)[2]])
 
 
 def move_box(a_from_b: np.ndarray, box: OrientedBox) -> OrientedBox:

@@ -79,10 +79,7 @@ class SamConfig(Settings):
 
 class TrainConfig(Settings):
     effort: float = Field(
-        1.0,
-        ge=0.01,
-        le=100,
-        description="multiple of the iterations and Gaussians that the number of photos suggests",
+        1.0, ge=0.01, le=100, description="multiple of the iterations and Gaussians that the number of photos suggests"
     )
     iterations: int = Field(
         0, ge=0, le=10**8, description="iterations of training, all schedules scale with them; 0: 2000, or 46 a photo"
@@ -92,7 +89,7 @@ class TrainConfig(Settings):
         0.03,
         ge=0,
         le=1000,
-        description="dB of held-out PSNR that 10 % more time must gain, else growth or training ends; 0: never",
+        description="dB of held-out PSNR that 10 % more time must gain, else training ends; 0: never",
     )
     budget: int = Field(0, ge=0, le=10**8, description="most Gaussians the map may have; 0: 100,000, or 2,300 a photo")
     block_photos: int = Field(
@@ -124,8 +121,7 @@ class LossConfig(Settings):
 
 class InstanceConfig(Settings):
     method: Literal["consensus", "hdbscan"] = Field(
-        "consensus",
-        description="segments merged as the masks of all photos agree, or the paper's clustering of features alone",
+        "consensus", description="segments merged as all masks agree, or the paper's clustering of features alone"
     )
     split: bool = Field(True, description="clusters of HDBSCAN are split into parts that are connected in space")
     settle: bool = Field(
@@ -201,7 +197,7 @@ PAPER: dict[str, Any] = {
 """OpenSplat3D as published: 30k iterations, each training all parameters at full resolution (3DGS reduces photos wider
 than 1600 pixels), with the densification threshold of the authors' LERF configuration; then HDBSCAN of the features
 alone. β, λ_inst2d, the growth of the crops (.3) and the threshold of silhouettes (.2) are constants, the paper's.
-What still differs from the paper stands in docs/benchmarks.md.
+What still differs from the paper is listed in docs/benchmarks.md.
 """
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -268,15 +264,14 @@ def expected(field: FieldInfo) -> str:
     """Type and range of a setting as text; a field's `title` gives it if the constraints do not."""
     kinds = _kinds(field)
     if field.title:
-        words = field.title
+        text = field.title
     elif isinstance(kinds[0], str):  # a Literal
-        words = ", ".join(kinds[:-1]) + f" or {kinds[-1]}"
+        text = ", ".join(kinds[:-1]) + f" or {kinds[-1]}"
     else:
-        words = {bool: "true or false", str: "text", int: "a whole number", float: "a number"}[kinds[0]]
-        for name, word in (("gt", "above"), ("ge", "from"), ("le", "to")):
-            bounds = [getattr(item, name) for item in field.metadata if hasattr(item, name)]
-            words += "".join(f" {word} {bound}" for bound in bounds)
-    return f"{words} or none" if NoneType in kinds else words
+        text = {bool: "true or false", str: "text", int: "a whole number", float: "a number"}[kinds[0]]
+        for name, relation in (("gt", "above"), ("ge", "from"), ("le", "to")):
+            text += "".join(f" {relation} {getattr(m, name)}" for m in field.metadata if hasattr(m, name))
+    return f"{text} or none" if NoneType in kinds else text
 
 
 def settings_text() -> str:
@@ -314,20 +309,19 @@ def _unknown(key: str, known: list[str]) -> str:
     near = _like(last, group, 0.6) or _like(last, known, 0.75) or difflib.get_close_matches(key, known, 1, 0.8)
     if near:
         return f"unknown setting '{key}', did you mean {' or '.join(near)}?"
-    group = group or known
-    return f"unknown setting '{_short(key)[1:-1]}', expected one of: {', '.join(group)}"
+    return f"unknown setting '{_short(key)[1:-1]}', expected one of: {', '.join(group or known)}"
 
 
-def _like(word: str, known: list[str], least: float) -> list[str]:
-    """The settings whose last name is the one nearest to `word`, when their similarity is at least `least`."""
-    last = {name: name.rpartition(".")[2] for name in known}
-    near = difflib.get_close_matches(word, sorted(set(last.values())), 1, least)
-    return [name for name in known if last[name] in near]
+def _like(name: str, known: list[str], least: float) -> list[str]:
+    """The settings whose last name is the one nearest to `name`, when their similarity is at least `least`."""
+    last = {key: key.rpartition(".")[2] for key in known}
+    near = difflib.get_close_matches(name, sorted(set(last.values())), 1, least)
+    return [key for key in known if last[key] in near]
 
 
-def _short(value: Any, most: int = 80) -> str:
+def _short(value: Any) -> str:
     text = repr(value)
-    return text if len(text) <= most else f"{text[: most - 3]}..."
+    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def flat(table: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

@@ -45,8 +45,7 @@ def torch_on_one_thread() -> Iterator[None]:
     """Within it torch computes on one thread, and the rasterizer by default on as many as torch had before.
 
     Idle workers of torch's OpenMP pool busy-wait for milliseconds, on processors that other threads need: with two
-    threads on two busy processors, a training step took four times the CPU time. A short prompt takes 10 ms on one
-    thread, 24 on two. Where torch is not loaded or has one thread already, nothing is done.
+    threads on two busy processors, a training step took four times the CPU time. Without torch, nothing is done.
     """
     torch = sys.modules.get("torch")
     before = 1 if torch is None else torch.get_num_threads()
@@ -119,14 +118,11 @@ def _control_groups(controller: str) -> Iterator[Path]:
 def _cores_of(folder: Path) -> float:
     """Cores that one control group grants: cpu.max ("150000 100000", or "max 100000"), or in version 1
     cpu.cfs_quota_us (−1: none) and cpu.cfs_period_us; infinity without a limit."""
+    new = folder / "cpu.max"
+    old = [folder / f"cpu.cfs_{name}_us" for name in ("quota", "period")]
     try:
-        if (folder / "cpu.max").is_file():
-            quota, period = (folder / "cpu.max").read_text(encoding="ascii").split()
-        else:
-            quota, period = (
-                (folder / f"cpu.cfs_{name}_us").read_text(encoding="ascii") for name in ("quota", "period")
-            )
-        return int(quota) / int(period) if quota.strip() != "max" and int(quota) > 0 else math.inf
+        quota, period = " ".join(file.read_text(encoding="ascii") for file in ([new] if new.is_file() else old)).split()
+        return int(quota) / int(period) if quota != "max" and int(quota) > 0 else math.inf
     except (OSError, ValueError, ZeroDivisionError):
         return math.inf
 

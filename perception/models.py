@@ -16,16 +16,7 @@ from perception.io.atomic import atomic_directory
 from perception.io.documents import brief
 from perception.map.checksums import facts_of, sha256
 from perception.onnx.sessions import model_graphs, model_root, refuse_outside_weights, side_files
-from perception.onnx.store import (
-    NAME,
-    RECORD,
-    Entry,
-    StoredModel,
-    catalogue,
-    find_model,
-    known_names,
-    models_folder,
-)
+from perception.onnx.store import NAME, RECORD, Entry, StoredModel, catalogue, find_model, known_names, models_folder
 from perception.progress import QUIET, Progress
 
 _KEPT = (".json", ".txt")  # of a folder, beside graphs and their weights: configurations and tokenizers
@@ -49,12 +40,12 @@ def check_file(file: str) -> dict[str, Any]:
         raise InputError(f"{file}: no such file, folder or stored model; {known_names()}")
     found = [describe_graph(graph) for graph in graphs]
     family, purpose, problem = judge(found)
-    told = [text for text in (*(entry.pop("warning") for entry in found), problem) if text]
+    notes = [text for text in (*(entry.pop("warning") for entry in found), problem) if text]
     if not problem:
-        told += _opened(purpose, str(path))
+        notes += _opened(purpose, str(path))
     unused = [str(graph) for graph in left_out]
-    about = {"model": str(path), "family": family, "purpose": purpose, "files": found, "left_out": unused}
-    return {**about, "warnings": list(dict.fromkeys(told))}
+    facts = {"model": str(path), "family": family, "purpose": purpose, "files": found, "left_out": unused}
+    return {**facts, "warnings": list(dict.fromkeys(notes))}
 
 
 def _opened(purpose: str | None, spec: str) -> list[str]:
@@ -86,8 +77,8 @@ def describe_graph(path: Path) -> dict[str, Any]:
         "bytes": path.stat().st_size,
         "family": family,
         "role": role,
-        "inputs": [_argument(value) for value in graph.session.get_inputs()],
-        "outputs": [_argument(value) for value in graph.session.get_outputs()],
+        "inputs": _arguments(graph.session.get_inputs()),
+        "outputs": _arguments(graph.session.get_outputs()),
         "providers": list(graph.session.get_providers()),
         "warning": provider_warning(path, graph.session),
     }
@@ -111,8 +102,8 @@ def recognise(graph: Any) -> tuple[str | None, str | None]:
     return (encoder_family(graph), "encoder") if graph.is_encoder else (None, None)
 
 
-def _argument(value: Any) -> dict[str, Any]:
-    return {"name": value.name, "shape": list(value.shape), "type": value.type}
+def _arguments(values: Any) -> list[dict[str, Any]]:
+    return [{"name": value.name, "shape": list(value.shape), "type": value.type} for value in values]
 
 
 def judge(found: Sequence[dict[str, Any]]) -> tuple[str | None, str | None, str]:
@@ -138,15 +129,15 @@ def add_model(name: str, sources: Sequence[str]) -> StoredModel:
 def get_model(name: str, progress: Progress = QUIET) -> StoredModel:
     """Fetches an entry of the catalogue from the Hugging Face hub into the store under its name, unless it is there.
 
-    What is fetched is told before. HF_ENDPOINT names a mirror of the hub. Files are verified by their known digests.
+    HF_ENDPOINT names a mirror of the hub. Files are verified by their known digests.
     """
     entry = catalogue().get(name)
     if entry is None:
         raise InputError(f"models get {name}: not in the catalogue; it holds {', '.join(catalogue())}")
     sizes = [size for size, _ in entry.files.values()]
     size = f", {sum(sizes) / 1e6:.1f} MB" if None not in sizes else ""
-    told = f"{len(sizes)} files{size}, of {entry.repository} at {entry.revision[:12]}"
-    progress.log(f"{name}: {told}, licence {entry.licence}, to {models_folder() / name}")
+    files = f"{len(sizes)} files{size}, of {entry.repository} at {entry.revision[:12]}"
+    progress.log(f"{name}: {files}, licence {entry.licence}, to {models_folder() / name}")
     known = find_model(name)
     if known is None or not _holds(known, entry):
         parts = models_folder() / ".parts" / name
@@ -172,13 +163,13 @@ def _fetched(entry: Entry, path: str, folder: Path) -> tuple[str, Path, str]:
     if not sys.stderr.isatty():
         disable_progress_bars()
     endpoint = os.environ.get("HF_ENDPOINT") or None  # the library reads it once, when it is imported
-    address = hub.hf_hub_url(entry.repository, path, revision=entry.revision, endpoint=endpoint)
+    version: dict[str, Any] = {"revision": entry.revision, "endpoint": endpoint}
+    address = hub.hf_hub_url(entry.repository, path, **version)
     try:
-        told = hub.hf_hub_download(entry.repository, path, revision=entry.revision, local_dir=folder, endpoint=endpoint)
+        file = Path(hub.hf_hub_download(entry.repository, path, local_dir=folder, **version))
     except (OSError, ValueError, RuntimeError) as error:  # its own and its HTTP library's errors among them
         reason = brief(error.__cause__ or error, 200)
         raise InputError(f"{address}: cannot be fetched ({reason}); run the command again to go on") from error
-    file = Path(told)
     expected = entry.files[path][1]
     if expected not in (None, found := sha256(file)):
         file.unlink()
@@ -219,11 +210,11 @@ def _install(name: str, files: Sequence[tuple[str, Path, str]]) -> StoredModel:
     with atomic_directory(target) as folder:
         entries = []
         for file_name, path, source in files:
-            target = folder / file_name
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(path, target)
-            entries.append({"name": file_name, "source": source, **facts_of(target)})
+            copy = folder / file_name
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, copy)
+            entries.append({"name": file_name, "source": source, **facts_of(copy)})
         family, purpose, _ = judge([describe_graph(graph) for graph in sorted(folder.rglob("*.onnx"))])
         record = json.dumps({"family": family, "purpose": purpose, "files": entries}, indent=1)
         (folder / RECORD).write_text(record + "\n", encoding="utf-8")
-    return StoredModel(name, models_folder() / name, family, purpose, entries)
+    return StoredModel(name, target, family, purpose, entries)

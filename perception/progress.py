@@ -46,19 +46,18 @@ class Progress:
             self._bar.clear()
         print(text, file=self.stream, flush=True)
 
-    def update(self, stage: str, done: int, total: int, *words: str) -> None:
+    def update(self, stage: str, done: int, total: int, *figures: str) -> None:
         """Shows the state of a stage; without a terminal, prints a line every ten seconds and at the end."""
         if self.quiet:
             return
         if self.terminal:
-            self._draw(stage, done, total, words)
+            self._draw(stage, done, total, figures)
             return
-        now = time.monotonic()
-        if done >= total or now - self._last >= 10:
-            self._last = now
-            print("  ".join([f"{stage}: {done}/{total}", *words]), file=self.stream, flush=True)
+        if done >= total or time.monotonic() - self._last >= 10:
+            self._last = time.monotonic()
+            print("  ".join([f"{stage}: {done}/{total}", *figures]), file=self.stream, flush=True)
 
-    def _draw(self, stage: str, done: int, total: int, words: tuple[str, ...]) -> None:
+    def _draw(self, stage: str, done: int, total: int, figures: tuple[str, ...]) -> None:
         from tqdm import tqdm
 
         starts = self._bar is None or self._bar.desc != f"{stage}: "
@@ -66,7 +65,7 @@ class Progress:
             self.close()
             self._bar = tqdm(total=total, desc=f"{stage}: ", file=self.stream, dynamic_ncols=True, bar_format=LINE)
         self._bar.total = total
-        self._bar.set_postfix_str(", ".join(words or (f"{done}/{total}",)), refresh=False)
+        self._bar.set_postfix_str(", ".join(figures or (f"{done}/{total}",)), refresh=False)
         self._bar.update(done - self._bar.n)
         if starts or done >= total:  # tqdm itself draws nothing in a bar's first tenth of a second
             self._bar.refresh()

@@ -17,7 +17,7 @@ from perception.bags.read import CAMERA_INFO, IMAGES, Bag, camera_of, decode_ima
 from perception.errors import InputError
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
 from perception.io.atomic import atomic_directory
-from perception.io.outputs import check_empty
+from perception.map.outputs import check_empty
 from perception.photos.camera_file import read_camera, write_camera_info
 from perception.photos.lens import FISHEYE, PERSPECTIVE
 from perception.photos.video import Chooser

@@ -60,7 +60,7 @@ def finish(name: str, options: argparse.Namespace, report: dict[str, Any], text:
     from perception.tasks.folder import versions
 
     facts = {"bench": name, "arguments": dict(vars(options)), "machine": machine(), "versions": versions(), **report}
-    with atomic_file(options.output / f"{name}.json") as aside:
+    with atomic_file(options.output / f"{name}.json", parents=True) as aside:
         aside.write_text(json.dumps(facts, indent=1, default=str), encoding="utf-8")
     with atomic_file(options.output / f"{name}.txt") as aside:
         aside.write_text(text + "\n", encoding="utf-8")

@@ -144,9 +144,8 @@ def _gsplat(inputs: dict[str, Any]) -> list[Tensor]:
 
     colors, features = inputs["colors"], inputs["features"]
     channels = [colors] if features is None else [colors, features, features.square()]
-    names = ("means", "quats", "scales", "opacities")
-    rest = [inputs[name] for name in ("viewmats", "Ks", "width", "height")]
-    rendered, _, _ = rasterization(*(inputs[name] for name in names), torch.cat(channels, dim=1), *rest)
+    names = ("means", "quats", "scales", "opacities", "viewmats", "Ks", "width", "height")
+    rendered, _, _ = rasterization(**{name: inputs[name] for name in names}, colors=torch.cat(channels, dim=1))
     image, *more = rendered.split([part.shape[1] for part in channels], dim=-1)
     return [image, more[0], more[1] - more[0].square()] if more else [image]
 
@@ -191,7 +190,7 @@ def _row(name: str, scene: dict[str, Any], case: Case, turns: list[Turn]) -> dic
     stats = exact_stats if case.simd in ON_GPU else stats  # pairs are not counted there
     pairs, cpu = max(1, stats.contributing_pairs), [t.cpu for t in turns]
     seconds = {stage: statistics.median(t.stages.get(stage, 0.0) for t in turns) for stage in STAGES}
-    whole = max(sum(seconds.values()), 1e-12)
+    total = max(sum(seconds.values()), 1e-12)
     return {
         "scene": name, "simd": case.simd, "dtype": case.dtype, "threads": case.threads,
         "channels": f"RGB+{scene['features'].shape[1]}+var" if case.rich else "RGB",
@@ -202,7 +201,7 @@ def _row(name: str, scene: dict[str, Any], case: Case, turns: list[Turn]) -> dic
         "ns_per_pair": 1e9 * statistics.median(cpu) / pairs, "least_ns_per_pair": 1e9 * min(cpu) / pairs,
         "error_max": float((image - exact).abs().max()),
         "gradient_error": float((grad - exact_grad).norm() / exact_grad.norm()),
-        **{f"share_{stage}": seconds[stage] / whole for stage in STAGES},
+        **{f"share_{stage}": seconds[stage] / total for stage in STAGES},
     }  # fmt: skip
 
 
@@ -220,11 +219,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     chosen, rows, lines = cases(options.threads, options.dtypes, options.device), [], []
     for path in options.scenes or [None]:
         scene = load_scene(path) if path else synthetic_scene()
-        found = measure(path.stem if path else "synthetic", scene, chosen, options.rounds)
-        rows += found
-        lines.append(
-            f"{found[0]['scene']}: {found[0]['gaussians']} Gaussians, {found[0]['width']}×{found[0]['height']}, "
-            f"{found[0]['contributing_pairs'] / 1e6:.2f} M pairs contribute "
-            f"of {found[0]['evaluated_pairs'] / 1e6:.2f} M evaluated"
-        )
+        first, *more = measure(path.stem if path else "synthetic", scene, chosen, options.rounds)
+        rows += [first, *more]
+        pairs, evaluated = first["contributing_pairs"] / 1e6, first["evaluated_pairs"] / 1e6
+        size = f"{first['gaussians']} Gaussians, {first['width']}×{first['height']}"
+        lines.append(f"{first['scene']}: {size}, {pairs:.2f} M pairs contribute of {evaluated:.2f} M evaluated")
     finish("rasterizer", options, {"rows": rows}, "\n".join([*lines, table(rows, COLUMNS, HEADS)]))

@@ -16,7 +16,7 @@ from perception.calibration.board import Board, Detection
 from perception.calibration.solve import NAMES, Solution, solve
 from perception.errors import InputError
 from perception.io.atomic import atomic_file
-from perception.io.outputs import check_side_file, refuse_inputs
+from perception.map.outputs import check_side_file, refuse_inputs
 from perception.photos.camera_file import write_camera
 from perception.photos.decode import SUFFIXES, read_grey
 from perception.photos.video import frames

@@ -33,9 +33,9 @@ def build_parser() -> argparse.ArgumentParser:
 
 def _resume(argv: Sequence[str] | None) -> str:
     """The command that continues the interrupted one; `map` needs --resume for that."""
-    words = [str(word) for word in (sys.argv[1:] if argv is None else argv)]
-    more = ["--resume"] if words[:1] == ["map"] and "--resume" not in words else []
-    return shlex.join(["perception", *words, *more])
+    arguments = [str(argument) for argument in (sys.argv[1:] if argv is None else argv)]
+    more = ["--resume"] if arguments[:1] == ["map"] and "--resume" not in arguments else []
+    return shlex.join(["perception", *arguments, *more])
 
 
 def _warn(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:

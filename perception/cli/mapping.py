@@ -55,9 +55,7 @@ def register(commands: Any) -> None:
 
 
 def _add_map(commands: Any) -> None:
-    p = command(
-        commands, "map", _map, "build a map from photos, a video, a COLMAP workspace, a transforms.json or RGB-D"
-    )
+    p = command(commands, "map", _map, "build a map of photos, a video, a COLMAP workspace, a transforms.json or RGB-D")
     p.formatter_class, p.late_epilog = argparse.RawDescriptionHelpFormatter, _settings
     p.add_argument("input", type=Path, metavar="INPUT")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="MAP")
@@ -141,9 +139,8 @@ def _fleet(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     failed = [job for job in made if "error" in job]
     if failed:
         progress.log("\n".join(f"{job['output']}: {job['error']}" for job in failed))
-        raise InputError(
-            f"{args.jobs}: {len(failed)} of {len(made)} maps could not be made; mend the jobs and run it again"
-        )
+        found = f"{len(failed)} of {len(made)} maps could not be made"
+        raise InputError(f"{args.jobs}: {found}; mend the jobs and run it again")
     return {"maps": made}, "\n".join("{output}: {instances} instances".format(**job) for job in made)
 
 
@@ -161,17 +158,16 @@ def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     info = read_info(args.map)
     entries = Map.open(args.map).instances
     texts = {entry["id"]: entry["texts"] for entry in entries if entry.get("texts")}
-    told = info_text(args.map, info, texts)
+    lines = [info_text(args.map, info, texts)]
     info = {**info, "texts": texts} if texts else info
-    if not args.verify:
-        return info, told
-    states = verify_map(args.map)
-    lines = [f"{name}: {state}" for name, state in states.items()]
-    return {**info, "verified": states}, "\n".join([told, *lines])
+    if args.verify:
+        info["verified"] = verify_map(args.map)
+        lines += [f"{name}: {state}" for name, state in info["verified"].items()]
+    return info, "\n".join(lines)
 
 
 def _report(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.io.outputs import refuse_inputs
+    from perception.map.outputs import refuse_inputs
     from perception.query import load_map
     from perception.report.page import write_map_report
 
@@ -192,11 +188,11 @@ def _calibrate(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.calibration.board import Board
     from perception.calibration.calibrate import run_calibration
 
-    words = args.squares.lower().split("x")
-    if len(words) != 2 or not all(word.isdigit() for word in words):
+    counts = args.squares.lower().split("x")
+    if len(counts) != 2 or not all(count.isdigit() for count in counts):
         raise InputError(f"--squares is '{args.squares}'; expected columns x rows of squares, such as 8x11")
     marker = args.marker if args.marker is not None else 0.75 * args.square
-    board = Board(args.board, (int(words[0]), int(words[1])), args.square, marker, args.dictionary)
+    board = Board(args.board, (int(counts[0]), int(counts[1])), args.square, marker, args.dictionary)
     return run_calibration(args.input, args.output, board, args.model)
 
 

@@ -18,7 +18,7 @@ def register(commands: Any) -> None:
     p.add_argument("--top", type=int, default=20, metavar="K", help="at most so many hits of those that answer (20)")
     p.add_argument("--min-score", type=float, metavar="X", help="all with this score instead of those that answer")
     p.add_argument("--points", type=Path, metavar="OUT.ply", help="write the hits' points, labelled by instance_id")
-    p = command(commands, "index", _index, "many maps into one store, which is asked as a map is: query, serve")
+    p = command(commands, "index", _index, "many maps into one store, for query and serve as a map is")
     p.add_argument("maps", type=Path, nargs="*", metavar="MAP", help="maps that are new or may have changed")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="STORE")
     p.add_argument("--remove", type=Path, action="append", default=[], metavar="MAP", help="take it out of the store")
@@ -70,7 +70,7 @@ def register(commands: Any) -> None:
 
 
 def _query(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.io.outputs import refuse_inputs
+    from perception.map.outputs import refuse_inputs
     from perception.query import load_map
     from perception.report.text import guessed_names, query_text, write_hits
 
@@ -115,8 +115,8 @@ def _label(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     if args.text is None and not args.clear:
         raise InputError("label: no NAME given; write one, or --clear to take it away")
     label = set_labels(args.map, {args.id: args.text})[args.id]
-    said = f"instance {args.id} is called “{label}” now" if label else f"instance {args.id} has no name any more"
-    return {"id": args.id, "label": label}, said
+    text = f"instance {args.id} is called “{label}” now" if label else f"instance {args.id} has no name any more"
+    return {"id": args.id, "label": label}, text
 
 
 def _scale(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
@@ -147,15 +147,14 @@ def _upgrade(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
     facts = upgrade_map(args.map, args.output, progress=Progress(quiet=args.json))
     before, after = facts["encoder"]
-    said = f"embeddings by {after}, before by {before}" if before != after else "embeddings as they were"
-    return facts, f"{facts['map']}: {said}"
+    change = f"embeddings by {after}, before by {before}" if before != after else "embeddings as they were"
+    return facts, f"{facts['map']}: {change}"
 
 
 def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.export.export_map import export_map, side_file
+    from perception.export.export_map import ExportOptions, export_map, side_file
     from perception.export.mesh import check_outputs, export_mesh, export_voxels
-    from perception.export.transfer import ExportOptions
-    from perception.io.outputs import check_side_file, refuse_inputs
+    from perception.map.outputs import check_side_file, refuse_inputs
     from perception.map.write import read_map
     from perception.query.query_map import load_map
     from perception.query.scene_graph import write_graph
@@ -188,8 +187,8 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     if args.output is None:
         return facts, "\n".join(lines)
     options = ExportOptions(max_distance=args.max_distance, smooth=args.smooth, segments=args.segments)
-    how = (options, args.color, args.transform or args.align, args.granularity)
-    result, table = export_map(args.map, args.output, args.points, *how)
+    pose = args.transform or args.align
+    result, table = export_map(args.map, args.output, args.points, options, args.color, pose, args.granularity)
     return {**facts, **result}, "\n".join([*lines, table])
 
 

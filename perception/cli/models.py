@@ -59,7 +59,7 @@ def _get(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.progress import Progress
 
     if args.name is not None:
-        return _told(get_model(args.name, Progress()))
+        return _described(get_model(args.name, Progress()))
     lines = [f"{n:16} {e.purpose:5} {e.licence:12} {e.repository} at {e.revision[:12]}" for n, e in catalogue().items()]
     return {"catalogue": list(catalogue())}, "\n".join(lines)
 
@@ -67,10 +67,10 @@ def _get(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 def _add(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.models import add_model
 
-    return _told(add_model(args.name, args.source))
+    return _described(add_model(args.name, args.source))
 
 
-def _told(model: Any) -> tuple[dict[str, Any], str]:
+def _described(model: Any) -> tuple[dict[str, Any], str]:
     from perception.models import check_file
 
     warnings = check_file(str(model.folder))["warnings"]

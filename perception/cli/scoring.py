@@ -27,7 +27,7 @@ def register(commands: Any) -> None:
 
 
 def _eval_instances(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.evaluate.layouts import run_instances
+    from perception.evaluate.instances import run_instances
 
     return run_instances(args.prediction, args.truth, args.protocol)
 

@@ -1,6 +1,6 @@
 """Manual corrections of a map: rename, hide, merge, split, remove; with undo, redo and save.
 
-An `Editor` holds one opened map. Edits change memory only; `save` writes the whole map to a new place and swaps it in.
+An `Editor` holds one opened map. Edits change memory only; `save` writes the map to a new folder and swaps it in.
 Thread-safe: each edit is one step under a lock, so it is applied completely or not at all. A map that another program
 changed meanwhile is not overwritten.
 """
@@ -8,8 +8,9 @@ changed meanwhile is not overwritten.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
@@ -22,11 +23,11 @@ from perception.boxes import instance_entry
 from perception.config import FrameConfig, InstanceConfig
 from perception.edit.scale import scale_map
 from perception.errors import InputError
-from perception.io.atomic import writing
 from perception.io.json_shapes import LARGEST
 from perception.language.description import InstanceDescription, from_arrays, to_arrays
 from perception.map.files import map_signature, read_info
 from perception.map.map import Map, language_in, prefixed
+from perception.map.replace import writing
 from perception.map.write import read_map, write_map
 
 UNDO_DEPTH = 100
@@ -72,10 +73,14 @@ class Editor:
     def __init__(self, path: Path):
         self.path = Path(path)
         self._lock = threading.RLock()
+        self.reopen()
+
+    @_step
+    def reopen(self) -> None:
+        """Opens the map that is on disk now. Unsaved edits and the history are dropped."""
         read_info(self.path)  # its error is the clearest when there is no map
         self._signature = map_signature(self.path)
-        self.original = read_map(self.path)
-        gmap = self.original
+        self.original = gmap = read_map(self.path)
         descriptions, self._encoder = from_arrays(gmap.language) if gmap.language else ([], "")
         self._past = [_State("opened", gmap.instance_ids, tuple(gmap.instances), tuple(descriptions))]
         self._future: list[_State] = []
@@ -100,9 +105,11 @@ class Editor:
     @property
     def part_ids(self) -> np.ndarray:
         """[N] part of every Gaussian as opened, −1 = none; without the parts of merged, split or removed instances."""
-        known = [part["id"] for entry in self.instances for part in entry.get("parts", [])]
         ids = self.original.parts.get("ids")
-        return np.full(len(self.ids), -1) if ids is None else np.where(np.isin(ids, known), ids, -1)
+        return np.full(len(self.ids), -1) if ids is None else np.where(np.isin(ids, self._known_parts()), ids, -1)
+
+    def _known_parts(self) -> list[int]:
+        return [part["id"] for entry in self.instances for part in entry.get("parts", [])]
 
     @property
     def dirty(self) -> bool:
@@ -116,12 +123,12 @@ class Editor:
 
     def entry(self, instance: int) -> dict[str, Any]:
         """The entry of instance id `instance`; raises InputError when there is none."""
-        return self.instances[self._place(instance)]
+        return self.instances[self._row(instance)]
 
-    def _place(self, instance: int) -> int:
-        for place, entry in enumerate(self.instances):
+    def _row(self, instance: int) -> int:
+        for row, entry in enumerate(self.instances):
             if entry["id"] == instance:
-                return place
+                return row
         raise InputError(f"instance {instance}: not in {self.path}; expected one of its {len(self.instances)} ids")
 
     @_step
@@ -144,15 +151,12 @@ class Editor:
         parts = self.original.parts
         if "ids" not in parts:
             return parts
-        known = [part["id"] for entry in self._now.instances for part in entry.get("parts", [])]
-        alive = np.isin(np.unique(parts["ids"][parts["ids"] >= 0]), known)
-        parts = {**parts, "ids": self.part_ids.astype(np.int32)}
+        kept = np.isin(np.unique(parts["ids"][parts["ids"] >= 0]), self._known_parts())
         language = language_in(parts)
-        if not language or alive.all():
-            return parts
-        descriptions, encoder = from_arrays(language)
-        left = [description for description, lives in zip(descriptions, alive, strict=True) if lives]
-        return {"ids": parts["ids"], **prefixed(to_arrays(left, encoder))}
+        if language and not kept.all():
+            descriptions, encoder = from_arrays(language)
+            parts = prefixed(to_arrays(list(itertools.compress(descriptions, kept)), encoder))
+        return {**parts, "ids": self.part_ids.astype(np.int32)}
 
     # ------------------------------------------------------------------ editing
 
@@ -162,9 +166,9 @@ class Editor:
         del self._past[: max(0, len(self._past) - UNDO_DEPTH)]
 
     def _change(self, what: str, instance: int, **values: Any) -> None:
-        place = self._place(instance)
+        row = self._row(instance)
         instances = list(self.instances)
-        instances[place] = {**instances[place], **values}
+        instances[row] = {**instances[row], **values}
         self._push(what, instances=tuple(instances))
 
     @_step
@@ -184,17 +188,17 @@ class Editor:
         chosen = sorted(set(chosen))
         if len(chosen) < 2:
             raise InputError(f"merge: found {len(chosen)} instance, expected at least 2; choose another one to join")
-        places = [self._place(instance) for instance in chosen]
+        rows = [self._row(instance) for instance in chosen]
         new = self._next_id()
         ids = np.where(np.isin(self.ids, chosen), new, self.ids).astype(np.int32)
-        entries = [self.instances[place] for place in places]
+        entries = [self.instances[row] for row in rows]
         weights = np.array([entry["num_gaussians"] for entry in entries], np.float64)
         label = next((entry["label"] for entry in entries if entry.get("label")), None)
         score = float(weights @ [entry["score"] for entry in entries] / weights.sum())
         merged = self._entry(new, ids, score, max(int(entry.get("views", 0)) for entry in entries), label)
         if texts := [text for entry in entries for text in entry.get("texts", [])]:
             merged["texts"] = texts
-        self._replace(f"merged {', '.join(map(str, chosen))} into {new}", places, ids, [merged], _joined)
+        self._replace(f"merged {', '.join(map(str, chosen))} into {new}", rows, ids, [merged])
         return new
 
     @_step
@@ -204,28 +208,25 @@ class Editor:
         The parts in the map's hierarchy are used where the instance has any. Otherwise its Gaussians alone are
         clustered by their features again, with finer settings.
         """
-        place = self._place(instance)
-        rows = np.flatnonzero(self.ids == instance)
-        gmap = self.original
-        found = self._parts_of(self.instances[place], rows)
-        if found.max(initial=-1) < 1:
+        row = self._row(instance)
+        own, entry = np.flatnonzero(self.ids == instance), self.instances[row]
+        part = self._parts_of(entry, own)
+        if part.max(initial=-1) < 1:
             raise InputError(f"instance {instance}: its Gaussians are all alike, there is nothing to split")
         first = self._next_id()
         ids = self.ids.copy()
-        known, means = found >= 0, gmap.means[rows]
-        ids[rows] = np.where(known, found, found[known][cKDTree(means[known]).query(means)[1]]) + first
-        news = list(range(first, first + int(found.max()) + 1))
-        entry = self.instances[place]
-        parts = [self._entry(new, ids, entry["score"], entry.get("views", 0)) for new in news]
-        self._replace(f"split {instance} into {len(parts)}", [place], ids, parts, lambda descriptions: descriptions[0])
-        return news
+        known, means = part >= 0, self.original.means[own]
+        ids[own] = np.where(known, part, part[known][cKDTree(means[known]).query(means)[1]]) + first
+        new_ids = list(range(first, first + int(part.max()) + 1))
+        parts = [self._entry(new, ids, entry["score"], entry.get("views", 0)) for new in new_ids]
+        self._replace(f"split {instance} into {len(parts)}", [row], ids, parts)
+        return new_ids
 
     @_step
     def remove(self, instance: int) -> None:
         """Removes an instance from the list; its Gaussians stay and belong to no instance."""
-        place = self._place(instance)
         ids = np.where(self.ids == instance, -1, self.ids).astype(np.int32)
-        self._replace(f"removed {instance}", [place], ids, [], _joined)
+        self._replace(f"removed {instance}", [self._row(instance)], ids, [])
 
     @_step
     def undo(self) -> str | None:
@@ -252,7 +253,7 @@ class Editor:
 
     @_step
     def save(self) -> None:
-        """Writes the edited map in place of the old one; InputError if another program changed that meanwhile."""
+        """Writes the edited map over the old one; InputError if another program changed that meanwhile."""
         with writing(self.path):
             if self.outdated:
                 raise InputError(
@@ -276,11 +277,6 @@ class Editor:
             facts = scale_map(self.path, None, FrameConfig(known_length=known_length), improve=True)
             self.reopen()
         return facts
-
-    @_step
-    def reopen(self) -> None:
-        """Opens the map that is on disk now. Unsaved edits and the history are dropped."""
-        self.__dict__.update({name: value for name, value in vars(Editor(self.path)).items() if name != "_lock"})
 
     # ------------------------------------------------------------------ helpers
 
@@ -308,29 +304,25 @@ class Editor:
         points, weights = gmap.means[rows].astype(np.float64), gmap.opacities[rows].astype(np.float64)
         return instance_entry(instance, points, weights, score, views, label)
 
-    def _replace(
-        self,
-        what: str,
-        places: list[int],
-        ids: np.ndarray,
-        news: list[dict[str, Any]],
-        describe: Callable[[list[InstanceDescription]], InstanceDescription],
-    ) -> None:
-        """Replaces the entries at `places` by `news`, which are inserted at the first of these places."""
-        entries, descriptions = list(self.instances), list(self._now.descriptions)
-        said = [descriptions[place] for place in places] if descriptions else []
-        for place in reversed(places):
-            del entries[place]
-            if descriptions:
-                del descriptions[place]
-        entries[places[0] : places[0]] = news
-        if said:
-            descriptions[places[0] : places[0]] = [describe(said) for _ in news]
-        self._push(what, ids=ids, instances=tuple(entries), descriptions=tuple(descriptions))
+    def _replace(self, what: str, rows: list[int], ids: np.ndarray, new: list[dict[str, Any]]) -> None:
+        """Replaces the entries in `rows` by `new`, which are inserted at the first of these rows, each with the joined
+        description of the replaced."""
+        now, first = self._now, min(rows)
+
+        def spliced(old: Sequence[Any], inserted: list[Any]) -> tuple[Any, ...]:
+            later = (value for row, value in enumerate(old) if row > first and row not in rows)
+            return (*old[:first], *inserted, *later)
+
+        descriptions = now.descriptions
+        if descriptions:
+            descriptions = spliced(descriptions, [_joined([descriptions[row] for row in rows])] * len(new))
+        self._push(what, ids=ids, instances=spliced(now.instances, new), descriptions=descriptions)
 
 
 def _joined(descriptions: list[InstanceDescription]) -> InstanceDescription:
     """One description of several instances: all views, their mean embedding, the palette of the one with most views."""
+    if len(descriptions) == 1:
+        return descriptions[0]
     best = max(descriptions, key=lambda d: len(d.views))
     total = np.sum([d.embedding * len(d.views) for d in descriptions], axis=0)
     norm = float(np.linalg.norm(total))

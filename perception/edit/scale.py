@@ -14,13 +14,13 @@ from perception.frame.recentre import map_from_input, moved
 from perception.frame.scale import KnownLength, Measurement, combined, known_length
 from perception.frame.world_frame import measured_scale
 from perception.geometry import move_points
-from perception.io.atomic import writing
 from perception.map.map import Map
+from perception.map.replace import writing
 from perception.map.write import read_map, write_map
 from perception.types import OrientedBox
 
 CENTROID_ERROR, CLICK_ERROR = 0.05, 1.0
-"""Standard deviations of a place in a map: of a centroid in extents of its instance (a part may be unseen), and of a
+"""Standard deviations of a position in a map: of a centroid in extents of its instance (a part may be unseen), and of a
 chosen point in median sizes of a Gaussian."""
 
 
@@ -28,7 +28,7 @@ def scale_map(path: Path, output: Path | None, options: FrameConfig, improve: bo
     """Writes the map at `path` in metres to `output` (None: in place).
 
     The unit is measured by `options` (a known length also between instances or points) and by GPS of the photos.
-    Returns {"map", "factor", "scale", "gravity", "notes"}. InputError when nothing tells the unit; with `improve` also
+    Returns {"map", "factor", "scale", "gravity", "notes"}. InputError when nothing gives the unit; with `improve` also
     when the map is in metres already with a smaller standard error, or without any stated.
     """
     target = output or path
@@ -61,7 +61,7 @@ def scaled(gmap: Map, factor: float) -> Map:
     def entry(old: dict[str, Any]) -> dict[str, Any]:
         new = {**old, "centroid": (factor * np.array(old["centroid"])).tolist()}
         new["obb"] = move_box(b_from_a, OrientedBox.from_json(old["obb"])).to_json()
-        new["aabb"] = {end: (factor * np.array(place)).tolist() for end, place in old.get("aabb", {}).items()}
+        new["aabb"] = {end: (factor * np.array(corner)).tolist() for end, corner in old.get("aabb", {}).items()}
         if "parts" in old:
             new["parts"] = [entry(part) for part in old["parts"]]
         return new
@@ -78,15 +78,15 @@ def scaled(gmap: Map, factor: float) -> Map:
 
 def _measured(gmap: Map, options: FrameConfig) -> tuple[Measurement, list[str]]:
     length = None if options.known_length is None else known_length(options.known_length)
-    found = []
+    measured = []
     if length is not None and length.pixels is None:
-        found.append(_between(gmap, length))
+        measured.append(_between(gmap, length))
         options = options.model_copy(update={"known_length": None})
     views = gmap.located_views()
     if options.tag_size is not None or options.board is not None:
         views = [gmap.with_photo(view) for view in gmap.views]
     other, notes = measured_scale(views, np.empty((0, 3)), options)
-    scale, warnings = combined([*found, *([] if other is None else [other])])
+    scale, warnings = combined(measured if other is None else [*measured, other])
     if scale is None:
         give = "give --known-length, --tag-size or --board"
         raise InputError(f"{gmap.path}: nothing tells its unit; {give}" + "".join(notes))
@@ -97,14 +97,14 @@ def _between(gmap: Map, length: KnownLength) -> Measurement:
     """Metres per unit by a length between two instances or two points of the map."""
     if length.names is not None:
         entries = [_instance(gmap, name) for name in length.names]
-        places = np.array([each["centroid"] for each in entries])
+        ends = np.array([each["centroid"] for each in entries])
         errors = [CENTROID_ERROR * float(np.mean(each["obb"]["extent"])) for each in entries]
         source = f"known length {length.metres:g} m between {' and '.join(length.names)}"
     else:
         assert length.points is not None
-        places, source = length.points, f"known length {length.metres:g} m between two points"
+        ends, source = length.points, f"known length {length.metres:g} m between two points"
         errors = [CLICK_ERROR * float(np.median(gmap.scales.max(axis=1)))] * 2
-    units = float(np.linalg.norm(places[0] - places[1]))
+    units = float(np.linalg.norm(ends[0] - ends[1]))
     error = float(np.linalg.norm(errors))
     if units <= 3 * error:
         raise InputError(f"known length: its ends are {units:.3g} map units apart, too near each other to measure by")

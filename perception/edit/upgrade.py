@@ -15,12 +15,12 @@ from perception.gaussians.photos import training_view
 from perception.instances.describe import Load, describe_instances
 from perception.instances.silhouettes import render_silhouettes
 from perception.instances.texts import read_texts, store_texts
-from perception.io.atomic import writing
 from perception.language.base import Encoder, reading_of
 from perception.language.description import from_arrays, to_arrays
 from perception.language.encoders import make_encoder
 from perception.language.ocr import TextReader, make_reader
 from perception.map.map import MAX_SIDE, Map, language_in, prefixed
+from perception.map.replace import writing
 from perception.map.write import read_map, write_map
 from perception.photos.view_json import locate_photo
 from perception.progress import QUIET, Progress
@@ -102,9 +102,8 @@ def _shown(
     number = {view.name: n for n, view in enumerate(gmap.views)}
     unknown = [name for d in descriptions for name in d.views if name not in number]
     if unknown:
-        raise InputError(
-            f"{gmap.path}: lists the photo {unknown[0]!a}, which is none of its views; build the map again"
-        )
+        found = f"lists the photo {unknown[0]!a}, which is none of its views"
+        raise InputError(f"{gmap.path}: {found}; build the map again")
     wanted = sorted({number[name] for d in descriptions for name in d.views})
     located = {n: replace(gmap.views[n], photo=locate_photo(gmap.views[n], gmap.path)) for n in wanted}
     gaussians, side = as_gaussians(gmap), gmap.setting("photos", "max_side", MAX_SIDE)

@@ -93,8 +93,7 @@ def evaluate_images(prediction_dir: str | Path, truth_dir: str | Path) -> dict[s
             )
         views[stem] = {"psnr": min(psnr(predicted, true), 100.0), "ssim": ssim(predicted, true), "missing": False}
     return {
-        "psnr": float(np.mean([v["psnr"] for v in views.values()])),
-        "ssim": float(np.mean([v["ssim"] for v in views.values()])),
+        **{name: float(np.mean([view[name] for view in views.values()])) for name in ("psnr", "ssim")},
         "views": views,
         "num_views": len(views),
         "missing": [stem for stem, v in views.items() if v["missing"]],

@@ -1,4 +1,4 @@
-"""Parts of an alignment: likely rotations (extended Gaussian images), and the steps of Gauss-Newton on a place."""
+"""Parts of an alignment: likely rotations (extended Gaussian images), and the steps of Gauss-Newton on a pose."""
 
 from __future__ import annotations
 
@@ -16,11 +16,13 @@ COUNT, KEPT, APART = 12_000, 64, 12.0
 """Rotations tried, which leave none farther than about 8° away; kept, at least APART degrees from one another."""
 SHARPNESS = 25.0
 """Concentration of the kernel about each normal: a standard deviation of 8°."""
+TUKEY = 4.5
+"""Cut-off of Tukey's weights in medians of |r|, about three standard deviations."""
 _SIDE = 33
 
 
 @dataclass(frozen=True)
-class Place:
+class Similarity:
     """x ↦ linear x + shift; linear [3, 3] a rotation times a scale, shift [3]; score: higher is better."""
 
     linear: np.ndarray
@@ -34,16 +36,16 @@ class Place:
     def scale(self) -> float:
         return float(np.cbrt(np.linalg.det(self.linear)))
 
-    def stepped(self, delta: np.ndarray, middle: np.ndarray, extent: float) -> Place:
+    def stepped(self, delta: np.ndarray, middle: np.ndarray, extent: float) -> Similarity:
         """Turned, shifted and, with 7 numbers, scaled about `middle`; delta: lengths, at the distance `extent`."""
         turn = Rotation.from_rotvec(delta[:3] / extent).as_matrix()
         grow = float(np.exp(delta[6] / extent)) if len(delta) == 7 else 1.0
         rotation = nearest_rotation(turn @ self.linear / self.scale)
-        return Place(grow * self.scale * rotation, grow * turn @ (self.shift - middle) + middle + delta[3:6])
+        return Similarity(grow * self.scale * rotation, grow * turn @ (self.shift - middle) + middle + delta[3:6])
 
 
 def jacobian(points: np.ndarray, slopes: np.ndarray, middle: np.ndarray, extent: float, similar: bool) -> np.ndarray:
-    """[P, 6 or 7] derivative of f by `Place.stepped`, given its slopes [P, 3] at points [P, 3]."""
+    """[P, 6 or 7] derivative of f by `Similarity.stepped`, given its slopes [P, 3] at points [P, 3]."""
     arm = (points - middle) / extent
     parts = [np.cross(arm, slopes), slopes]
     return np.concatenate([*parts, np.einsum("ij,ij->i", arm, slopes)[:, None]] if similar else parts, axis=1)
@@ -70,7 +72,7 @@ def robust_gain(I: np.ndarray, g: np.ndarray) -> tuple[float, np.ndarray, np.nda
         i, h = I - (w * I).sum() / total, g - (w * g).sum() / total
         gain = float((w * i * h).sum() / max((w * i * i).sum(), 1e-9))
         r = gain * i - h
-        spread = 4.5 * float(np.median(np.abs(r))) + 1e-6
+        spread = TUKEY * float(np.median(np.abs(r))) + 1e-6
         w = np.maximum(1 - (r / spread) ** 2, 0) ** 2
     return gain, r, w / spread**2
 

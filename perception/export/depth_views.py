@@ -1,4 +1,4 @@
-"""Depth rendered from a map's own cameras: what each place of the scene is, as those cameras see it."""
+"""Depth rendered from a map's own cameras, and whether these see a point, see through it, or see neither."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from scipy.ndimage import binary_erosion
 
 from perception.gaussians.model import Gaussians
 from perception.gaussians.render import render
@@ -32,8 +33,9 @@ class DepthView:
         """[H, W] float32, the mean of the colour channels."""
         return self.colors.mean(axis=2)
 
-    def look(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of points [P, 3]: (in camera axes with u and v, [P, 5]; depth [P] in the pixel of each, 0 = none)."""
+    def look(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of points [P, 3]: their coordinates [P, 3] in camera axes, their pixels u, v [P, 2], and the depth [P] there,
+        0 = none or outside the image."""
         own = np.einsum("nj,ij->ni", points, self.camera_from_world[:3, :3]) + self.camera_from_world[:3, 3]
         height, width = self.depth.shape
         front = own[:, 2] > 1e-9
@@ -42,13 +44,13 @@ class DepthView:
         depth = np.zeros(len(points), np.float32)
         column, row = uv[inside].astype(np.int64).T
         depth[inside] = self.depth[row, column]
-        return np.concatenate([own, uv], axis=1), depth
+        return own, uv, depth
 
     def seen(self, points: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """(rows of the points [P, 3] within `tolerance` of the depth, their u, v, and [R, 3] in camera axes)."""
-        own, depth = self.look(points)
+        own, uv, depth = self.look(points)
         rows = np.flatnonzero((depth > 0) & (np.abs(depth - own[:, 2]) <= tolerance))
-        return rows, own[rows, 3], own[rows, 4], own[rows, :3]
+        return rows, uv[rows, 0], uv[rows, 1], own[rows]
 
 
 @torch.no_grad()
@@ -79,7 +81,7 @@ def observe(
     on, free = np.zeros((2, len(points)), np.int32)
     gap = np.zeros(len(points))
     for view in views:
-        own, depth = view.look(points)
+        own, _, depth = view.look(points)
         ahead = np.where(depth > 0, depth - own[:, 2], -np.inf)
         near = np.abs(ahead) <= tolerance
         on += near
@@ -110,15 +112,14 @@ def grid_cells(points: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray
 
 
 def _backprojected(view: DepthView) -> tuple[np.ndarray, np.ndarray]:
+    """Points and unit normals [P, 3] in the world, of every second pixel with depth whose neighbours have depth."""
     height, width = view.depth.shape
     v, u = np.mgrid[:height, :width] + 0.5
     rays = np.stack([(u - view.K[0, 2]) / view.K[0, 0], (v - view.K[1, 2]) / view.K[1, 1], np.ones_like(u)], axis=-1)
     own = rays * view.depth[..., None]
     normal = np.cross(own[2:, 1:-1] - own[:-2, 1:-1], own[1:-1, 2:] - own[1:-1, :-2])[::2, ::2]
-    whole = view.depth > 0
-    whole = whole[1:-1, 1:-1] & whole[2:, 1:-1] & whole[:-2, 1:-1] & whole[1:-1, 2:] & whole[1:-1, :-2]
-    whole = whole[::2, ::2]
-    inner = own[1:-1, 1:-1][::2, ::2][whole]
-    length = np.linalg.norm(normal[whole], axis=1, keepdims=True)
+    known = binary_erosion(view.depth > 0)[1:-1, 1:-1][::2, ::2]  # also of the four neighbours
+    inner = own[1:-1, 1:-1][::2, ::2][known]
+    length = np.linalg.norm(normal[known], axis=1, keepdims=True)
     rotation, shift = view.camera_from_world[:3, :3], view.camera_from_world[:3, 3]
-    return (inner - shift) @ rotation, (normal[whole] / np.maximum(length, 1e-30)) @ rotation
+    return (inner - shift) @ rotation, (normal[known] / np.maximum(length, 1e-30)) @ rotation

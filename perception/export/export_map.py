@@ -1,12 +1,13 @@
 """`perception export`: transfers the instances of a map to a cloud, or to the map's own surface points. A scan from
-another frame is placed in the map by a known transform, or by registration.
+another frame is aligned with the map by a known transform, or by registration.
 """
 
 from __future__ import annotations
 
 import json
 import time
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +17,39 @@ from perception.colors import instance_palette, rgb8_from_sh
 from perception.errors import InputError
 from perception.export.align import align
 from perception.export.depth_views import DepthView, depth_views
+from perception.export.neighbors import nearest_gaussian
 from perception.export.render import as_gaussians, map_views
+from perception.export.smooth import read_segments, segment_cloud, vote
 from perception.export.spz import write_spz
-from perception.export.transfer import ExportOptions, check_overlap, export_labels, write_export
 from perception.frame.recentre import map_from_input
 from perception.geometry import check_similarity, move_points, scale_of
-from perception.io.cloud import read_cloud
+from perception.io.atomic import atomic_file
+from perception.io.cloud import read_cloud, write_cloud
 from perception.map.write import Map, read_map
 from perception.types import PointCloud
 
 MOST_VIEWS, LONG_SIDE = 90, 320
 """Views rendered for a registration, and their size in pixels."""
+
+
+SCANNET = Path("scannet")
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """How labels are transferred; the defaults are the paper's.
+
+    max_distance: in map units, beyond which points stay unlabelled; None = no limit.
+    smooth: superpoint vote, on or off. segments: a ScanNet *.segs.json to use instead of our own segmentation, or
+    SCANNET for the one that ScanNet's segmentator makes of a mesh.
+
+    >>> ExportOptions(max_distance=0.05, smooth=False)
+    ExportOptions(max_distance=0.05, smooth=False, segments=None)
+    """
+
+    max_distance: float | None = None
+    smooth: bool = True
+    segments: Path | None = None
 
 
 def rendered_depth(gmap: Map, most: int, long_side: int) -> list[DepthView]:
@@ -44,13 +67,9 @@ def aligned(gmap: Map, scan: PointCloud, name: str) -> tuple[np.ndarray, dict[st
     """
     found = align(rendered_depth(gmap, MOST_VIEWS, LONG_SIDE), scan, similar=not gmap.metric)
     if found.refusal is not None:
-        raise InputError(
-            f"{name}: cannot be aligned with the map: {found.refusal}; give the place with --transform FILE"
-        )
-    facts = {
-        key: round(float(getattr(found, key)), 6) for key in ("scale", "agreement", "overlap", "cover", "rms", "rival")
-    }
-    return found.map_from_scan, {"verdict": "accepted", **facts}
+        raise InputError(f"{name}: cannot be aligned with the map: {found.refusal}; give --transform FILE")
+    names = ("scale", "agreement", "overlap", "cover", "rms", "rival")
+    return found.map_from_scan, {"verdict": "accepted", **{key: round(getattr(found, key), 6) for key in names}}
 
 
 def read_transform(path: Path) -> np.ndarray:
@@ -62,9 +81,8 @@ def read_transform(path: Path) -> np.ndarray:
             rows = json.loads(text)
             rows = rows["map_from_scan"] if isinstance(rows, dict) else rows
         else:
-            rows = [
-                [float(word) for word in line.replace(",", " ").split()] for line in text.splitlines() if line.strip()
-            ]
+            lines = (line.replace(",", " ").split() for line in text.splitlines())
+            rows = [[float(number) for number in line] for line in lines if line]
     except (OSError, ValueError, KeyError) as error:
         raise InputError(f"{path}: expected a 4 × 4 matrix as text or JSON ({error})") from error
     return check_similarity(rows, str(path))
@@ -86,7 +104,7 @@ def export_map(
     points: Path | None,
     options: ExportOptions,
     color: str = "original",
-    place: Path | bool = False,
+    pose: Path | bool = False,
     granularity: str = "default",
 ) -> tuple[dict[str, Any], str]:
     """Labels a cloud, writes it and its sidecar JSON, and returns (JSON-able facts, table).
@@ -95,7 +113,7 @@ def export_map(
     result are in the coordinates of the map's input (`map_from_input`). Without `points` they are the map's, or the
     input's if that was only shifted.
 
-    color: of the written points, "original" or "instance". place: `points` lie in a frame of their own: True registers
+    color: of the written points, "original" or "instance". pose: `points` lie in a frame of their own: True registers
     them (`export.align`), a path names a file with map_from_scan [4, 4]. The result keeps that frame; the sidecar and
     the facts hold `map_from_scan`. granularity: see `at_granularity`.
 
@@ -109,32 +127,32 @@ def export_map(
         return _export_spz(map_path, output, points)
     if output.suffix.lower() not in SUFFIXES:
         raise InputError(f"{output}: unknown kind of cloud '{output.suffix}', expected one of {', '.join(SUFFIXES)}")
-    if place and points is None:
-        raise InputError("--align and --transform place a scan in the map; give it with --points")
-    known = None if isinstance(place, bool) else read_transform(place)
+    if pose and points is None:
+        raise InputError("--align and --transform need a scan; give it with --points")
+    known = None if isinstance(pose, bool) else read_transform(pose)
     gmap = read_map(map_path)
     ids, instances = at_granularity(gmap, granularity)
-    given = None if points is None else read_cloud(points)
-    placed = map_from_input(map_path, gmap.info)
-    if points is None and not np.array_equal(placed[:3, :3], np.eye(3)):
-        placed = np.eye(4)
+    cloud = None if points is None else read_cloud(points)
+    map_from_cloud = map_from_input(map_path, gmap.info)
+    if points is None and not np.array_equal(map_from_cloud[:3, :3], np.eye(3)):
+        map_from_cloud = np.eye(4)
     facts: dict[str, Any] = {}
     if known is not None:
-        placed = known
-    elif place and given is not None:
-        placed, facts["alignment"] = aligned(gmap, given, str(points))
-    if place:
-        facts["map_from_scan"] = placed.tolist()
-    moved = not np.array_equal(placed, np.eye(4))
-    means = move_points(np.linalg.inv(placed), gmap.means.astype(np.float64)) if moved else gmap.means
+        map_from_cloud = known
+    elif pose and cloud is not None:
+        map_from_cloud, facts["alignment"] = aligned(gmap, cloud, str(points))
+    if pose:
+        facts["map_from_scan"] = map_from_cloud.tolist()
+    moved = not np.array_equal(map_from_cloud, np.eye(4))
+    means = move_points(np.linalg.inv(map_from_cloud), gmap.means.astype(np.float64)) if moved else gmap.means
     began = time.perf_counter()
-    if given is None:
+    if cloud is None:
         rows, options = np.flatnonzero(gmap.opacities >= SURFACE_OPACITY), ExportOptions(smooth=False)
-        given = PointCloud(means[rows], rgb8_from_sh(gmap.sh[rows, 0]))
+        cloud = PointCloud(means[rows], rgb8_from_sh(gmap.sh[rows, 0]))
         labels = ids[rows].astype(np.int32)
     else:
-        labels = export_labels(means, ids, given, options)
-    cloud, inside = given, check_overlap(means, given.points)
+        labels = export_labels(means, ids, cloud, options)
+    inside = check_overlap(means, cloud.points)
     if color == "instance":
         cloud = replace(cloud, colors=instance_palette(labels))
     sidecar = write_export(output, cloud, labels, instances, facts)  # last: where it is, everything was written
@@ -144,7 +162,7 @@ def export_map(
         "inside_map": inside,
         "seconds": time.perf_counter() - began,
         "max_distance": options.max_distance,
-        "metric": gmap.metric and abs(scale_of(placed) - 1) < 1e-9,
+        "metric": gmap.metric and abs(scale_of(map_from_cloud) - 1) < 1e-9,
         "smoothed": options.smooth,
         **sidecar,
     }
@@ -159,8 +177,8 @@ def _export_spz(map_path: Path, output: Path, points: Path | None) -> tuple[dict
     write_spz(output, gmap)
     size, ids = output.stat().st_size, side_file(output)
     share = size / max((map_path / "gaussians.ply").stat().st_size, 1)
-    told = f"{output}: {len(gmap)} Gaussians, {share:.0%} of the PLY's size; instance ids in {ids}"
-    return {"spz": str(output), "gaussians": len(gmap), "bytes": size, "instance_ids": str(ids)}, told
+    text = f"{output}: {len(gmap)} Gaussians, {share:.0%} of the PLY's size; instance ids in {ids}"
+    return {"spz": str(output), "gaussians": len(gmap), "bytes": size, "instance_ids": str(ids)}, text
 
 
 def at_granularity(gmap: Map, granularity: str) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
@@ -197,3 +215,77 @@ def _table(result: dict[str, Any]) -> str:
     if result["inside_map"] < 0.5:
         lines.append(f"only {result['inside_map']:.0%} of the points lie inside the map: same frame and unit?")
     return "\n".join(lines)
+
+
+def export_labels(
+    means: np.ndarray, instance_ids: np.ndarray, cloud: PointCloud, options: ExportOptions | None = None
+) -> np.ndarray:
+    """Instance of each point [P] int32, −1 = none: that of the nearest mean (OpenSplat3D, point cloud transfer).
+    means [N, 3] in the cloud's frame, instance_ids [N] int32 (−1 = noise, ignored as in the released code)."""
+    options = options or ExportOptions()
+    limit = options.max_distance
+    if limit is not None and not limit >= 0:
+        raise InputError(f"max_distance is {limit}; expected a length that is not negative")
+    used = np.isfinite(means).all(axis=1) & (instance_ids >= 0)
+    nearest = nearest_gaussian(cloud.points, means[used], max_distance=limit)
+    labels = np.append(instance_ids[used], -1).astype(np.int32)[nearest]
+    if not options.smooth or not (labels >= 0).any():
+        return labels
+    if options.segments in (None, SCANNET):
+        segments = segment_cloud(cloud, scannet=options.segments is not None)
+    else:
+        segments = read_segments(options.segments, len(labels))
+    smoothed = vote(labels, segments)
+    if limit is not None:
+        smoothed[labels < 0] = -1  # points beyond the map stay unlabelled
+    return np.where(np.isfinite(cloud.points).all(axis=1), smoothed, -1).astype(np.int32)
+
+
+def check_overlap(means: np.ndarray, points: np.ndarray) -> float:
+    """Share of the finite points inside the map's bounds (1st to 99th percentile of its means).
+    InputError when the two bounding boxes do not overlap: the cloud has another frame or unit."""
+    finite = points[np.isfinite(points).all(axis=1)]
+    if len(finite) == 0:
+        raise InputError("cloud: all coordinates are NaN or infinite; nothing can be labelled")
+    means = means[np.isfinite(means).all(axis=1)]
+    if len(means) == 0:
+        raise InputError("map: holds no Gaussians; nothing can be labelled")
+    low, high = np.percentile(means, [1, 99], axis=0)
+    cloud_low, cloud_high = finite.min(axis=0), finite.max(axis=0)
+    gap = np.maximum(np.maximum(low - cloud_high, cloud_low - high), 0)
+    if gap.any():
+        boxes = f"cloud {_box(cloud_low, cloud_high)}, map {_box(low, high)}"
+        found = f"does not overlap the map: it lies {np.linalg.norm(gap):.3g} units away ({boxes})"
+        raise InputError(f"cloud: {found}; bring it into the map's frame")
+    return float(((finite >= low) & (finite <= high)).all(axis=1).mean())
+
+
+def _box(low: np.ndarray, high: np.ndarray) -> str:
+    return " x ".join(f"{a:.3g}..{b:.3g}" for a, b in zip(low, high, strict=True))
+
+
+def write_export(
+    path: Path,
+    cloud: PointCloud,
+    labels: np.ndarray,
+    instances: Mapping[int, Mapping[str, Any]],
+    facts: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Writes the cloud with `instance_id` and its sidecar JSON (same stem); returns the sidecar.
+
+    labels [P] int32, −1 = none; points and order are the cloud's own. instances: {id: {"score", "label"}} of the map.
+    Entries have "score", "label", "num_points"; those of parts also their `parent`, of groups the `instances` in them.
+    facts: further keys of the sidecar.
+    """
+    rows = {}
+    ids, counts = np.unique(labels[labels >= 0], return_counts=True)
+    for i, n in zip(ids.tolist(), counts.tolist(), strict=True):
+        known = instances.get(i, {})
+        row = {"score": float(known.get("score", 1.0)), "label": known.get("label"), "num_points": n}
+        rows[str(i)] = row | {key: known[key] for key in ("parent", "instances") if key in known}
+    sidecar = {**(facts or {}), "instances": rows}
+    with atomic_file(path.with_suffix(".json")) as new:
+        new.write_text(json.dumps(sidecar, indent=1), encoding="utf-8")
+    labelled = {"instance_id": labels.astype(np.int32)}
+    write_cloud(path, PointCloud(cloud.points, cloud.colors, cloud.normals, cloud.faces, labelled))
+    return sidecar

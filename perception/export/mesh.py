@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from perception.colors import instance_palette, rgb8_from_sh
 from perception.errors import InputError
-from perception.export.depth_views import DepthView
-from perception.export.export_map import rendered_depth
+from perception.export.depth_views import DepthView, observe
+from perception.export.export_map import SURFACE_OPACITY, ExportOptions, export_labels, rendered_depth
 from perception.export.neighbors import nearest_gaussian
-from perception.export.transfer import ExportOptions, export_labels
-from perception.export.volume import FREE, OCCUPIED, closed_body, grid_shape, occupancy, signed_distance
 from perception.frame.recentre import map_from_input
-from perception.io.atomic import replacing
+from perception.geometry import camera_centres
+from perception.io.atomic import atomic_file
 from perception.io.cloud import write_cloud
 from perception.io.open3d import fuse_depth, write_glb
 from perception.map.write import Map
@@ -23,6 +24,9 @@ from perception.types import PointCloud
 
 MOST_VIEWS, LONG_SIDE = 300, 640
 MESHES = (".ply", ".glb")
+UNKNOWN, FREE, OCCUPIED = 0, 1, 2
+MOST_VOXELS = 200_000_000
+_SLAB = 1 << 19
 
 
 def check_outputs(mesh: Path | None, voxels: Path | None, voxel_size: float | None) -> None:
@@ -43,7 +47,7 @@ def export_mesh(
     A .ply has `instance_id` by vertex, too, and the input's coordinates, a .glb those of the map.
 
     The surface: rendered depth fused in a truncated signed distance field (`io.open3d.fuse_depth`), labelled as a scan
-    is. One instance: `volume.closed_body`. voxel: None = two pixels at the median depth; of an instance
+    is. One instance: `closed_body`. voxel: None = two pixels at the median depth; of an instance
     at least a 64th of its longest side. color: "original" or "instance". InputError for a map without views, and for an
     instance that it does not have.
 
@@ -62,9 +66,8 @@ def export_mesh(
         own = gmap.instance_ids == instance
         if not own.any():
             raise InputError(f"--instance {instance}: the map has no such instance; `perception query` lists their ids")
-        bounds = np.percentile(
-            gmap.means[own & (gmap.opacities >= min(0.5, gmap.opacities[own].max()))], [1, 99], axis=0
-        )
+        opaque = own & (gmap.opacities >= min(SURFACE_OPACITY, gmap.opacities[own].max()))
+        bounds = np.percentile(gmap.means[opaque], [1, 99], axis=0)
         size = voxel or max(_footprint(views), float((bounds[1] - bounds[0]).max()) / 64)
         low, high = bounds[0] - size, bounds[1] + size
         points, faces = closed_body(low, high, size, views, gmap.means, own)
@@ -76,8 +79,8 @@ def export_mesh(
         write_glb(output, points, colors, faces)
     else:
         origin = _origin(gmap)
-        placed = points + origin if origin.any() else points
-        write_cloud(output, PointCloud(placed, colors, None, faces, {"instance_id": labels}))
+        vertices = points + origin if origin.any() else points
+        write_cloud(output, PointCloud(vertices, colors, None, faces, {"instance_id": labels}))
     facts = {"vertices": len(points), "faces": len(faces), "voxel_size": size, "method": method, "unit": _unit(gmap)}
     return facts, f"{output}: {len(faces)} triangles, {method}, voxels of {size:.4g} {facts['unit']}"
 
@@ -94,9 +97,9 @@ def export_voxels(gmap: Map, output: Path, voxel: float | None) -> tuple[dict[st
     (True, 'm')
     """
     views = rendered_depth(gmap, MOST_VIEWS, LONG_SIDE // 2)
-    eyes = np.array([-view.camera_from_world[:3, :3].T @ view.camera_from_world[:3, 3] for view in views])
-    solid = gmap.means[gmap.opacities >= 0.5] if (gmap.opacities >= 0.5).any() else gmap.means
-    bounds = np.percentile(solid, [1, 99], axis=0)
+    eyes = camera_centres(np.stack([view.camera_from_world for view in views]))
+    solid = gmap.opacities >= SURFACE_OPACITY
+    bounds = np.percentile(gmap.means[solid] if solid.any() else gmap.means, [1, 99], axis=0)
     low, high = np.minimum(bounds[0], eyes.min(axis=0)), np.maximum(bounds[1], eyes.max(axis=0))
     size = voxel or (0.05 if gmap.metric else float(np.linalg.norm(high - low)) / 128)
     low, high = low - 2 * size, high + 2 * size
@@ -109,7 +112,7 @@ def export_voxels(gmap: Map, output: Path, voxel: float | None) -> tuple[dict[st
         "frame": np.array(gmap.frame),
         "unit": np.array(_unit(gmap)),
     }
-    with replacing(output) as file:
+    with atomic_file(output) as new, new.open("wb") as file:
         np.savez(file, **arrays)
     shares = {name: float((state == value).mean()) for name, value in (("free", FREE), ("occupied", OCCUPIED))}
     facts = {"shape": list(state.shape), "voxel_size": size, "unit": _unit(gmap), **shares}
@@ -127,9 +130,74 @@ def _footprint(views: list[DepthView]) -> float:
 
 def _origin(gmap: Map) -> np.ndarray:
     """Offset [3] from map to input coordinates; 0 where axes or units differ, as in `export`."""
-    placed = map_from_input(gmap.path or Path(), gmap.info)
-    return -placed[:3, 3] if np.array_equal(placed[:3, :3], np.eye(3)) else np.zeros(3)
+    pose = map_from_input(gmap.path or Path(), gmap.info)
+    return -pose[:3, 3] if np.array_equal(pose[:3, :3], np.eye(3)) else np.zeros(3)
 
 
 def _unit(gmap: Map) -> str:
     return "m" if gmap.metric else "unknown"
+
+
+def grid_shape(low: np.ndarray, high: np.ndarray, voxel: float) -> tuple[int, int, int]:
+    """Voxels of a side above 0 from corner `low` to beyond `high`; InputError when they are too many."""
+    shape = np.maximum(np.ceil((high - low) / voxel), 1)
+    if shape.prod() > MOST_VOXELS:
+        raise InputError(f"--voxel-size {voxel:g} gives {shape.prod():.2g} voxels; at most {MOST_VOXELS:.0e} are held")
+    return int(shape[0]), int(shape[1]), int(shape[2])
+
+
+def centres(low: np.ndarray, shape: Sequence[int], voxel: float) -> np.ndarray:
+    """Centres [X · Y · Z, 3] of the voxels, z fastest."""
+    return (np.indices(shape).reshape(len(shape), -1).T + 0.5) * voxel + low
+
+
+def occupancy(low: np.ndarray, shape: tuple[int, int, int], voxel: float, views: Sequence[DepthView]) -> np.ndarray:
+    """[X, Y, Z] uint8: OCCUPIED where views see a surface in the voxel (depth within half its diagonal of the centre),
+    unless more than twice as many see farther, then FREE; UNKNOWN where none looks or all are blocked."""
+    state = np.empty(shape, np.uint8).reshape(shape[0], -1)
+    slab = max(_SLAB // (shape[1] * shape[2]), 1)
+    for x in range(0, shape[0], slab):
+        part = (min(slab, shape[0] - x), *shape[1:])
+        on, free, _ = observe(centres(low + np.array([x * voxel, 0, 0]), part, voxel), views, voxel * np.sqrt(3) / 2)
+        seen = np.where((on > 0) & (2 * on >= free), OCCUPIED, np.where(free > 0, FREE, UNKNOWN))
+        state[x : x + part[0]] = seen.reshape(part[0], -1)
+    return state.reshape(shape)
+
+
+def signed_distance(state: np.ndarray, voxel: float) -> np.ndarray:
+    """[X, Y, Z] float32: distance of each centre to the nearest occupied one, in map units; in occupied voxels minus
+    that to the nearest other. Unknown space is no obstacle here; infinity if nothing is occupied."""
+    held = state == OCCUPIED
+    if not held.any():
+        return np.full(state.shape, np.inf, np.float32)
+    outside = ndimage.distance_transform_edt(~held) - ndimage.distance_transform_edt(held)
+    return np.asarray(outside * voxel, np.float32)
+
+
+def closed_body(
+    low: np.ndarray, high: np.ndarray, voxel: float, views: Sequence[DepthView], means: np.ndarray, own: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(vertices [V, 3] float32, faces [F, 3] int32) of a watertight mesh between corners `low` and `high`.
+
+    Space carving (Kutulakos & Seitz 2000) with depth: a voxel is outside if views see farther than it, or if the
+    nearest of means [N, 3] is not `own` [N]; hidden space counts as body, so that a side which no photo shows
+    reaches to the bounds. Near the surface the mean of depth − z locates it in the voxel. The largest connected part is
+    kept, its hollows are filled, and the level 0 is meshed by marching cubes (Lorensen & Cline 1987).
+    """
+    from skimage.measure import marching_cubes
+
+    shape = grid_shape(low, high, voxel)
+    voxels, reach = centres(low, shape, voxel), 3 * voxel
+    on, free, gap = observe(voxels, views, reach)
+    level = np.where((on > 0) & (2 * on >= free), gap / reach, np.where(free > 0, 1.0, -1.0))
+    nearest = nearest_gaussian(voxels, means)
+    level = np.where(own[nearest] & (nearest >= 0), level, np.maximum(level, 0.5)).reshape(shape)
+    parts, count = ndimage.label(level < 0)
+    if count == 0:
+        raise InputError(f"the instance holds no voxel of {voxel:g}; choose a smaller --voxel-size")
+    body = parts == 1 + int(np.argmax(np.bincount(parts.ravel())[1:]))
+    filled = ndimage.binary_fill_holes(body)
+    level = np.where(filled, np.minimum(np.where(body, level, -1.0), -1e-3), np.maximum(level, 1e-3))
+    vertices, faces, _, _ = marching_cubes(np.pad(level, 1, constant_values=1.0), 0.0)
+    points = low + (vertices - 0.5) * voxel  # index 1 after padding is the centre of the first voxel
+    return points.astype(np.float32), faces.astype(np.int32)

@@ -57,9 +57,7 @@ class Neighbors:
         return np.where(indices >= 0, self.rows[indices], -1), np.sqrt(squared, out=squared)
 
 
-def nearest_gaussian(
-    points: np.ndarray, means: np.ndarray, *, chunk: int = CHUNK, max_distance: float | None = None
-) -> np.ndarray:
+def nearest_gaussian(points: np.ndarray, means: np.ndarray, max_distance: float | None = None) -> np.ndarray:
     """Index [P] int64 of the nearest of means [N, 3] for each of points [P, 3].
 
     −1 for points that are not finite or farther than max_distance from every mean. Equal distances go to the smaller
@@ -68,8 +66,8 @@ def nearest_gaussian(
     result = np.full(len(points), -1, np.int64)
     if np.isfinite(means).all(axis=1).any():
         tree, limit = Neighbors(means), np.inf if max_distance is None else max_distance
-        for begin in range(0, len(points), chunk):
-            result[begin : begin + chunk] = tree.query(points[begin : begin + chunk], 1, limit)[0][:, 0]
+        for begin in range(0, len(points), CHUNK):
+            result[begin : begin + CHUNK] = tree.query(points[begin : begin + CHUNK], 1, limit)[0][:, 0]
     return result
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 
@@ -16,12 +17,16 @@ from perception.frame.recentre import map_from_input, moved
 from perception.gaussians.model import Gaussians
 from perception.gaussians.render import render
 from perception.gaussians.views import depth_image
+from perception.inputs.transforms import read_frames
 from perception.instances.silhouettes import render_silhouettes
 from perception.io.atomic import atomic_file
 from perception.io.documents import safe_name
-from perception.io.outputs import refuse_inputs
+from perception.map.outputs import refuse_inputs
 from perception.map.write import Map, read_map
 from perception.photos.decode import SUFFIXES
+from perception.photos.lens import camera_from_lens
+from perception.photos.views import make_view
+from perception.pictures import features_to_rgb
 from perception.query.crops import cut_out
 from perception.query.query_map import QueryMap
 from perception.types import View
@@ -68,8 +73,6 @@ def _picture_names(names: list[str]) -> list[str]:
 
 def _listed(cameras: Path | None) -> list[Path]:
     """A transforms.json and the photos it lists, whether they exist or not."""
-    from perception.inputs.transforms import read_frames
-
     if cameras is None:
         return []
     photos = [cameras.parent / name for name, _, _ in read_frames(cameras)]
@@ -97,9 +100,6 @@ def map_views(gmap: Map, held_out: bool = True) -> list[View]:
 
 def _cameras(path: Path) -> list[View]:
     """The frames of a transforms.json as views; their photos need not exist."""
-    from perception.inputs.transforms import read_frames
-    from perception.photos.views import make_view
-
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a transforms.json with the cameras to render")
     frames = read_frames(path)
@@ -115,10 +115,6 @@ def _through_lens(kind: str, gaussians: Gaussians, gmap: Map, view: View) -> np.
     """The image with the view's lens distortion, warped from a wider pinhole image."""
     if view.lens is None:
         return _picture(kind, gaussians, gmap, view)
-    import cv2
-
-    from perception.photos.lens import camera_from_lens
-
     width, height = view.lens.width, view.lens.height
     grid = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1).reshape(-1, 2)
     rays = np.asarray(camera_from_lens(view.lens).cam_from_img(grid), np.float64)[:, :2]
@@ -129,9 +125,9 @@ def _through_lens(kind: str, gaussians: Gaussians, gmap: Map, view: View) -> np.
     wide = View(view.name, view.photo, K, int(size[0]), int(size[1]), view.camera_from_world)
     picture = _picture(kind, gaussians, gmap, wide)
     where = (rays * [fx, fy] + K[:2, 2] - 0.5).astype(np.float32).reshape(height, width, 2)
-    nearest = picture.dtype != np.uint8  # ids and depths must not be interpolated
-    how = cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC
-    return np.asarray(cv2.remap(picture, where[..., 0], where[..., 1], how))
+    # Ids and depths must not be interpolated.
+    interpolation = cv2.INTER_CUBIC if picture.dtype == np.uint8 else cv2.INTER_NEAREST
+    return np.asarray(cv2.remap(picture, where[..., 0], where[..., 1], interpolation))
 
 
 @torch.no_grad()
@@ -144,30 +140,16 @@ def _picture(kind: str, gaussians: Gaussians, gmap: Map, view: View) -> np.ndarr
     if kind == "depth":
         depth = depth_image(gaussians, pose, K, view.width, view.height)
         return (depth * 1000).round().clamp(0, 65535).numpy().astype(np.uint16)
-    out = render(
-        gaussians,
-        pose,
-        K,
-        view.width,
-        view.height,
-        harmonics=True,
-        features=gaussians.features if kind == "features" else None,
-    )
-    if kind == "rgb":
-        return (out.colors[0].clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
-    if kind == "features":
-        from perception.pictures import features_to_rgb
-
-        assert out.features is not None  # features were given
+    features = gaussians.features if kind == "features" else None
+    out = render(gaussians, pose, K, view.width, view.height, harmonics=True, features=features)
+    if out.features is not None:
         return features_to_rgb(out.features[0].numpy())
-    raise ValueError(f"unknown kind of picture: {kind}")
+    return (out.colors[0].clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
 
 
 def write_picture(path: Path, image: np.ndarray) -> None:
     """Writes an image [H, W] or [H, W, 3] RGB; folders are made. InputError when that fails."""
-    import cv2
-
     if image.ndim == 3:
         image = np.ascontiguousarray(image[..., ::-1])
-    with atomic_file(path) as aside:
+    with atomic_file(path, parents=True) as aside:
         aside.write_bytes(cv2.imencode(".png", image)[1].tobytes())

@@ -120,30 +120,27 @@ def segment_cloud(cloud: PointCloud, scannet: bool = False) -> np.ndarray:
     if scannet and not meshed:
         raise InputError("cloud: has no faces, as ScanNet's segments need; leave out --segments scannet or give a mesh")
     require_memory(_BYTES_PER_POINT * len(points), "smoothing", "export without it (--no-smooth) or split the cloud")
-    lists = None if meshed else neighbor_lists(points, NORMAL_NEIGHBORS)
     if cloud.faces is not None and meshed:
         edges, normals = mesh_edges(cloud.faces), scannet_normals(points, cloud.faces)
         if not scannet:
             length = np.linalg.norm(normals, axis=1, keepdims=True)
             normals = np.where(length > CREASE, normals / np.maximum(length, CREASE), normals)
     else:
-        assert lists is not None  # there are no faces
+        lists = neighbor_lists(points, NORMAL_NEIGHBORS)
         edges, normals = list_edges(lists[:, : NEIGHBORS + 1]), list_normals(points, lists)
     if cloud.normals is not None and not scannet:
         normals = np.nan_to_num(cloud.normals)
     weights = scannet_weights(points, normals, edges, oriented=meshed or cloud.normals is not None)
     if not meshed and cloud.normals is not None:  # meshes have no edges across gaps; estimated normals show steps
         weights += _STEP_WEIGHT * step_weights(points, normals, edges)
-    if lists is not None and cloud.colors is not None:
+    if not meshed and cloud.colors is not None:
         near = lists[:, :_COLOR_NEIGHBORS]  # a missing neighbour (−1) is the point itself
         near = cloud.colors[np.where(near >= 0, near, np.arange(len(points), dtype=near.dtype)[:, None])]
         middle = near.shape[1] // 2  # of the values of each channel
         colors = np.partition(near, middle, axis=1)[:, middle].astype(np.float32)
-        difference = colors[edges[:, 0]] - colors[edges[:, 1]]
-        distance = np.sqrt(np.einsum("ei,ei->e", difference, difference)) / np.float32(255)
+        distance = np.linalg.norm(colors[edges[:, 0]] - colors[edges[:, 1]], axis=1) / np.float32(255)
         weights += COLOR_WEIGHT * np.maximum(distance - _COLOR_EDGE, 0)
-    weights = np.nan_to_num(weights, nan=2.0).astype(np.float32)
-    return felzenszwalb(edges, weights, len(points))
+    return felzenszwalb(edges, np.nan_to_num(weights, nan=2.0), len(points))
 
 
 def vote(labels: np.ndarray, segments: np.ndarray) -> np.ndarray:
@@ -153,14 +150,13 @@ def vote(labels: np.ndarray, segments: np.ndarray) -> np.ndarray:
         raise InputError(f"{len(segments)} segment ids for {len(labels)} points; they must be the same points in order")
     if len(labels) == 0:
         return labels.astype(np.int32)
-    key = np.sort((segments.astype(np.int64) << 32) | (labels.astype(np.int64) + (1 << 31)))
-    first = np.flatnonzero(np.concatenate(([True], key[1:] != key[:-1])))
-    counts = np.diff(np.append(first, len(key)))
-    segment, label = key[first] >> 32, (key[first] & 0xFFFFFFFF) - (1 << 31)
+    pairs = (segments.astype(np.int64) << 32) | (labels.astype(np.int64) + (1 << 31))
+    pairs, counts = np.unique(pairs, return_counts=True)
+    segment, label = pairs >> 32, (pairs & 0xFFFFFFFF) - (1 << 31)
     order = np.lexsort((label, -counts, segment))
-    winner = order[np.concatenate(([True], np.diff(segment[order]) != 0))]
-    chosen = np.zeros(int(segment.max()) + 1, np.int32)
-    chosen[segment[winner]] = label[winner]
+    known, first = np.unique(segment[order], return_index=True)
+    chosen = np.zeros(int(known[-1]) + 1, np.int32)
+    chosen[known] = label[order[first]]
     return chosen[segments]
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.atomic import replacing
+from perception.io.atomic import atomic_file
 from perception.map.map import Map
 
 MAGIC, VERSION = 0x5053474E, 2
@@ -33,15 +33,17 @@ def write_spz(path: Path, gmap: Map) -> None:
     colours 1/510. InputError where a value is not finite.
     """
     data = spz_bytes(gmap, path)
-    with replacing(path.with_suffix(".npy")) as file:
+    with atomic_file(path.with_suffix(".npy")) as new, new.open("wb") as file:
         np.save(file, gmap.instance_ids.astype(np.int32))
-    with replacing(path) as file:
-        file.write(data)
+    with atomic_file(path) as new:
+        new.write_bytes(data)
 
 
 def spz_bytes(gmap: Map, path: Path = Path("map.spz")) -> bytes:
-    """The file's bytes; path: for messages."""
-    check_finite(gmap, path)
+    """The file's bytes. InputError naming `path` where a value is not finite."""
+    for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
+        if not np.isfinite(getattr(gmap, name)).all():
+            raise InputError(f"{path}: {name} of some Gaussians are not finite; upgrade or rebuild the map")
     count, degree = len(gmap), math.isqrt(gmap.sh.shape[1]) - 1
     means = gmap.means.astype(np.float64) * [1, -1, -1]
     largest = max(1.0, float(np.abs(means).max(initial=0.0)))
@@ -60,13 +62,6 @@ def spz_bytes(gmap: Map, path: Path = Path("map.spz")) -> bytes:
     ]
     header = struct.pack("<IIIBBBB", MAGIC, VERSION, count, degree, bits, 0, 0)
     return gzip.compress(header + b"".join(column.tobytes() for column in columns), 6, mtime=0)
-
-
-def check_finite(gmap: Map, path: Path) -> None:
-    """InputError where a value is not finite; path: for the message."""
-    for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
-        if not np.isfinite(getattr(gmap, name)).all():
-            raise InputError(f"{path}: {name} of some Gaussians are not finite; upgrade or rebuild the map")
 
 
 def _harmonics(rest: np.ndarray) -> np.ndarray:

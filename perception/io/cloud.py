@@ -14,7 +14,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.arrays import read_npz
-from perception.io.atomic import replacing
+from perception.io.atomic import atomic_file
 from perception.io.ply import read_ply, write_ply
 from perception.machine import require_memory
 from perception.types import PointCloud
@@ -172,7 +172,7 @@ def _write_npz(path: Path, cloud: PointCloud) -> None:
     parts = {"points": cloud.points, "colors": cloud.colors, "normals": cloud.normals, "faces": cloud.faces}
     arrays = {name: values for name, values in parts.items() if values is not None}
     everything: dict[str, Any] = arrays | cloud.labels
-    with replacing(path) as file:
+    with atomic_file(path) as new, new.open("wb") as file:
         np.savez(file, **everything)
 
 
@@ -261,7 +261,7 @@ def _write_pcd(path: Path, cloud: PointCloud) -> None:
         f"COUNT {' '.join('1' for _ in columns)}\n"
         f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\nDATA binary\n"
     )
-    with replacing(path) as file:
+    with atomic_file(path) as new, new.open("wb") as file:
         file.write(header.encode("ascii"))
         rows.tofile(file)
 

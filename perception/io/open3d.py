@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError, missing_extra
-from perception.io.atomic import replacing
+from perception.io.atomic import atomic_file
 
 Shot = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """camera_from_world [4, 4], K [3, 3], depth [H, W] (0 = none) and colors [H, W, 3] in [0, 1], float32."""
@@ -75,9 +75,9 @@ def write_glb(path: Path, points: np.ndarray, colors: np.ndarray, faces: np.ndar
     o3d = load_open3d()
     mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(points), o3d.utility.Vector3iVector(faces))
     mesh.vertex_colors = o3d.utility.Vector3dVector((colors / 255) ** 2.2)
-    with TemporaryDirectory() as folder, replacing(path) as file:
+    with TemporaryDirectory() as folder, atomic_file(path) as new:
         o3d.io.write_triangle_mesh(f"{folder}/mesh.glb", mesh)
-        file.write(Path(folder, "mesh.glb").read_bytes())
+        new.write_bytes(Path(folder, "mesh.glb").read_bytes())
 
 
 def _sorted(points: np.ndarray, colors: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

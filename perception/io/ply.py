@@ -13,7 +13,7 @@ from typing import BinaryIO
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.atomic import replacing
+from perception.io.atomic import atomic_file
 
 Element = dict[str, np.ndarray]
 
@@ -89,7 +89,7 @@ def map_ply(path: str | Path, element: str) -> np.ndarray:
 def write_ply(path: str | Path, elements: Mapping[str, Mapping[str, np.ndarray]]) -> None:
     """Write elements of scalar properties [rows] and list properties [rows, k], in the order given.
     Binary little endian. The file appears complete or not at all."""
-    with replacing(path) as file:
+    with atomic_file(path) as new, new.open("wb") as file:
         file.write(_header(elements))
         for properties in elements.values():
             _packed(properties).tofile(file)

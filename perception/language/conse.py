@@ -152,6 +152,6 @@ def _cached(names: list[list[str]], encode: Any) -> np.ndarray:
     embedded = encode(flat)
     sizes = np.array([len(group) for group in names])
     classes = unit_rows(np.add.reduceat(embedded, np.cumsum(sizes) - sizes, axis=0) / sizes[:, None])
-    with suppress(OSError, InputError), atomic_file(path) as aside, aside.open("wb") as file:
+    with suppress(InputError), atomic_file(path, parents=True) as aside, aside.open("wb") as file:
         np.save(file, classes)  # without a writable cache the embeddings are recomputed each time
     return classes

@@ -13,7 +13,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.arrays import map_npy, read_npz
-from perception.io.atomic import standing
+from perception.io.atomic import current
 from perception.io.documents import DAMAGE, brief
 from perception.io.json_shapes import parsed
 from perception.io.ply import map_ply
@@ -41,7 +41,7 @@ class MapFiles:
         self._lock = threading.Lock()
         self._checked = False
         for left in reversed(range(_TRIES)):
-            self.path = standing(Path(path))
+            self.path = current(Path(path))
             self._identity = _folder_identity(self.path)
             try:
                 self._open()
@@ -157,13 +157,13 @@ _OF_PLY: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 def read_info(path: Path) -> dict[str, Any]:
     """The content of map.json; InputError when `path` is not a map or has an unsupported format version."""
-    return _read_facts(standing(Path(path)))[0]
+    return _read_facts(current(Path(path)))[0]
 
 
 def map_signature(path: Path) -> Signature:
     """Inodes, times and sizes that change when the map or its labels, or the store, at `path` change. InputError when
     none exists."""
-    folder = standing(path)
+    folder = current(path)
     names = (STORE,) if (folder / STORE).is_file() else (FACTS, EDITABLE)
     try:
         stats = [file.stat() for file in (folder, *(folder / name for name in names))]

@@ -21,12 +21,13 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.atomic import atomic_directory, atomic_file, writing
+from perception.io.atomic import atomic_file
 from perception.io.documents import safe_name
 from perception.io.ply import write_ply
 from perception.map.checksums import EDITABLE, FACTS, REPORT, facts_of, listed_files, seal, verify
 from perception.map.files import FORMAT_VERSION, MapFiles
 from perception.map.map import Map
+from perception.map.replace import map_directory, writing
 from perception.photos.view_json import StoredView, moved_record, stored_view, view_from_json, view_json
 from perception.types import View
 
@@ -49,7 +50,7 @@ def write_map(path: Path, gmap: Map, keep_report: bool = False, fresh: bool = Fa
     info["num_instances"] = len(gmap.instances)
     info["sh_degree"] = math.isqrt(gmap.sh.shape[1]) - 1
     info["views"] = [view_json(_recorded(view, path, gmap.path)) for view in gmap.views]
-    with writing(path), atomic_directory(path, fresh) as folder:
+    with writing(path), map_directory(path, fresh) as folder:
         write_gaussian_ply(folder / "gaussians.ply", gmap)
         np.save(folder / "features.npy", gmap.features.astype(np.float32))
         np.save(folder / "instance_ids.npy", gmap.instance_ids.astype(np.int32))

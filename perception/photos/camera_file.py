@@ -73,7 +73,7 @@ def write_camera_info(path: Path, message: Any, rectified: bool = False) -> None
 def _write(path: Path, name: str, size: tuple[int, int], kind: str, K: list[float], distortion: list[float]) -> None:
     import yaml
 
-    from perception.io.atomic import replacing
+    from perception.io.atomic import atomic_file
 
     blocks = {
         "camera_matrix": (3, 3, K),
@@ -84,8 +84,8 @@ def _write(path: Path, name: str, size: tuple[int, int], kind: str, K: list[floa
     data: dict[str, Any] = {"image_width": int(size[0]), "image_height": int(size[1]), "camera_name": name}
     data["distortion_model"] = kind
     data |= {key: {"rows": r, "cols": c, "data": numbers} for key, (r, c, numbers) in blocks.items()}
-    with replacing(path) as file:
-        file.write(yaml.safe_dump(data, sort_keys=False, default_flow_style=None).encode())
+    with atomic_file(path) as new:
+        new.write_text(yaml.safe_dump(data, sort_keys=False, default_flow_style=None), encoding="utf-8")
 
 
 def _data(data: dict[str, Any], key: str) -> Any:

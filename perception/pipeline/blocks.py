@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +24,8 @@ from perception.gaussians.size import sized
 from perception.gaussians.state import TrainRecord
 from perception.gaussians.views import surface_depth
 from perception.geometry import camera_centres
-from perception.io.atomic import writing
 from perception.machine import memory_limit
+from perception.map.replace import writing
 from perception.masks import MaskSource, make_source
 from perception.pipeline.checkpoint import BEFORE_MASKS, CHECKPOINT, digest, load_checkpoint, save_checkpoint
 from perception.pipeline.estimate import largest_budget
@@ -46,7 +45,7 @@ LEAST_GAIN = 0.85
 APART = 4.0
 """Distance between the features of two blocks, which are not comparable: more than the loss's margin of 1."""
 ONES = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype=np.uint8)
-"""How many bits of a byte are 1."""
+"""Number of bits of a byte that are 1."""
 RESULT = "result.pt"
 
 
@@ -71,13 +70,13 @@ def cut(scene: Scene, most: int) -> list[Block]:
     half has the fewest photos, if that is at most LEAST_GAIN of the block's.
     """
     count = len(scene.views)
-    whole = Block(np.full(3, -np.inf), np.full(3, np.inf), np.arange(count))
+    everything = Block(np.full(3, -np.inf), np.full(3, np.inf), np.arange(count))
     if most == 0 or count <= most or len(scene.points) == 0 or scene.report.get("points_from") == "random":
-        return [whole]
+        return [everything]
     points = _sample(scene.points)
     seen = np.stack([np.packbits(visible_points(view, points)) for view in scene.views])
     centres = camera_centres(np.stack([view.camera_from_world for view in scene.views]))
-    return _halved(whole, points, seen, centres, most)
+    return _halved(everything, points, seen, centres, most)
 
 
 def _sample(points: np.ndarray) -> np.ndarray:
@@ -113,8 +112,8 @@ def _halved(block: Block, points: np.ndarray, seen: np.ndarray, centres: np.ndar
 
     best, fewest = None, (np.inf, np.inf)
     for axis in range(3) if len(inside) else ():
-        for place in np.quantile(inside[:, axis], np.arange(0.2, 0.81, 0.1)):
-            halves = _divided(block, axis, float(place), share, centres)
+        for plane in np.quantile(inside[:, axis], np.arange(0.2, 0.81, 0.1)):
+            halves = _divided(block, axis, float(plane), share, centres)
             sizes = [len(half.views) for half in halves]
             if min(sizes) > 0 and max(sizes) <= LEAST_GAIN * len(block.views) and (max(sizes), sum(sizes)) < fewest:
                 best, fewest = halves, (max(sizes), sum(sizes))
@@ -124,35 +123,30 @@ def _halved(block: Block, points: np.ndarray, seen: np.ndarray, centres: np.ndar
 
 
 def _divided(
-    block: Block, axis: int, place: float, share: Callable[[Block], np.ndarray], centres: np.ndarray
+    block: Block, axis: int, plane: float, share: Callable[[Block], np.ndarray], centres: np.ndarray
 ) -> list[Block]:
-    """The block's halves below and above `place`, with the photos that see enough of them or stand in them: these look
-    through the space before them, where Gaussians would float that no other photo sees. share: of the points that each
-    of the block's photos sees, those in a box."""
-    sides = []
-    middle = np.where(np.arange(3) == axis, place, np.nan)
-    below = centres[block.views, axis] < place
-    low_side, high_side = (block.low, np.fmin(block.high, middle)), (np.fmax(block.low, middle), block.high)
-    for (low, high), stands in ((low_side, below), (high_side, ~below)):
-        half = replace(block, low=low, high=high)
-        sides.append(replace(half, views=block.views[(share(half) >= SEEN) | stands]))
-    return sides
+    """The block's halves below and above `plane` on `axis`, with the photos that see enough of them or were taken in
+    them: these look through the space before them, where Gaussians would float that no other photo sees. share: of the
+    points that each of the block's photos sees, those in a box."""
+    corner = np.where(np.arange(3) == axis, plane, np.nan)
+    below = centres[block.views, axis] < plane
+    lower = replace(block, high=np.fmin(block.high, corner))
+    upper = replace(block, low=np.fmax(block.low, corner))
+    return [
+        replace(half, views=block.views[(share(half) >= SEEN) | inside])
+        for half, inside in ((lower, below), (upper, ~below))
+    ]
 
 
-def optimiser(scene: Scene, most: int) -> Callable[[Run, Scene, list[View], list[View], MaskSource], Optimised]:
-    """`optimise` for a scene that is trained in one piece, `optimise_blocks` for a larger one. most: see `cut`."""
-    blocks = cut(scene, most)
-    return optimise if len(blocks) == 1 else partial(optimise_blocks, blocks)
-
-
-def optimise_blocks(
-    blocks: Sequence[Block], run: Run, scene: Scene, training: list[View], held_out: list[View], source: MaskSource
-) -> Optimised:
-    """Trains all blocks and joins their Gaussians, then labels all photos.
+def optimise_scene(run: Run, scene: Scene, training: list[View], held_out: list[View], source: MaskSource) -> Optimised:
+    """`optimise` for a scene of one block. Of a larger one, trains all blocks, joins them, and labels all photos.
 
     Each block is a task of the engine, in its own folder below `run.work`. A task that is finished is not run again.
     A block makes masks of its own where they need depth; others are made once per photo.
     """
+    blocks = cut(scene, run.config.train.block_photos)
+    if len(blocks) == 1:
+        return optimise(run, scene, training, held_out, source)
     label_by_tasks(run, training, source)
     held = {view.name for view in held_out}
     folders = [_task(run, scene, block, held, source.needs_depth) for block in blocks]
@@ -196,13 +190,13 @@ def nearby_rows(scene: Scene, blocks: Sequence[Block], counts: Sequence[int]) ->
 def joined(parts: Sequence[Gaussians]) -> Gaussians:
     """All Gaussians of the blocks. Features of different blocks are APART, as they are not comparable."""
     degree = max(part.sh.shape[1] for part in parts)
-    placed = []
+    padded = []
     for number, part in enumerate(parts):
         features = part.features.clone()
         features[:, 0] += APART * number
         missing = part.sh.new_zeros(len(part), degree - part.sh.shape[1], 3)
-        placed.append(replace(part, features=features, sh=torch.cat([part.sh, missing], dim=1)))
-    return Gaussians.concatenate(placed)
+        padded.append(replace(part, features=features, sh=torch.cat([part.sh, missing], dim=1)))
+    return Gaussians.concatenate(padded)
 
 
 def _task(run: Run, scene: Scene, block: Block, held: set[str], own_masks: bool) -> Path:
@@ -229,21 +223,21 @@ def _task(run: Run, scene: Scene, block: Block, held: set[str], own_masks: bool)
 
 def optimise_block(folder: str, progress: Progress = QUIET) -> None:
     """Trains the block whose task lies in `folder`, and writes RESULT there. Goes on from its checkpoint, if any."""
-    home = Path(folder)
-    if load_checkpoint(home / RESULT, home.name) is not None:
+    work = Path(folder)
+    if load_checkpoint(work / RESULT, work.name) is not None:
         return
-    scene, facts = read_task(home)
+    scene, facts = read_task(work)
     config = MapConfig.model_validate(facts["config"])
-    with writing(home / RESULT):
+    with writing(work / RESULT):
         device = choose_device(config.device)[0]
-        run = Run(Path(facts["source"]), config, home, Path(facts["masks"]), device, progress)
+        run = Run(Path(facts["source"]), config, work, Path(facts["masks"]), device, progress)
         held = set(facts["held_out"])
         training = [view for view in scene.views if view.name not in held]
         held_out = [view for view in scene.views if view.name in held]
         source, box = make_source(config.masks, config.sam), np.array(facts["box"])
         optimised = optimise(run, scene, training, held_out, source, box)
         gaussians = optimised.nearby.gaussians.to("cpu")
-        state = {"gaussians": {name: tensor.contiguous() for name, tensor in gaussians.named().items()}}
-        save_checkpoint(home / RESULT, {**state, "record": asdict(optimised.record)}, home.name)
+        state = {name: tensor.contiguous() for name, tensor in gaussians.named().items()}
+        save_checkpoint(work / RESULT, {"gaussians": state, "record": asdict(optimised.record)}, work.name)
         for name in (CHECKPOINT, BEFORE_MASKS):
-            (home / name).unlink(missing_ok=True)
+            (work / name).unlink(missing_ok=True)

@@ -36,7 +36,7 @@ Inputs = dict[str, dict[str, str]]
 
 def inputs_of(source: Path, config: MapConfig, output: Path) -> Inputs:
     """The files that the map of `source` at `output` is made from, without those that its run writes.
-    InputError where `source` is no input, or tells its photos in a file that cannot be read."""
+    InputError where `source` is no input, or lists its photos in a file that cannot be read."""
     own = {folder.resolve() for folder in (output, work_folder(output), frames_folder(output))}
     found: Inputs = {}
     try:
@@ -104,7 +104,7 @@ def hold_inputs(work: Path, source: Path, config: MapConfig, output: Path) -> In
 
 
 def refuse_changed(output: Path, info: dict[str, Any], now: Inputs) -> None:
-    """InputError where the finished map with `info` in its map.json was made from other files, or does not tell."""
+    """InputError where the finished map with `info` in its map.json was made from other files, or lists none."""
     todo = "choose another -o, or remove this map first"
     if "inputs" not in info:
         what = "an older version made this map and recorded no input files, which may have changed since"
@@ -112,16 +112,14 @@ def refuse_changed(output: Path, info: dict[str, Any], now: Inputs) -> None:
     _compare(output, info["inputs"], now, "since this map was made", todo)
 
 
-def _compare(told_by: Path, before: Any, now: Inputs, since: str, todo: str) -> None:
+def _compare(source: Path, before: Any, now: Inputs, since: str, todo: str) -> None:
     """InputError with the first files that differ."""
     try:
         old, new = ({(key, name): stat for key in one for name, stat in one[key].items()} for one in (before, now))
     except (AttributeError, LookupError, TypeError) as error:
-        raise InputError(f"{told_by}: its list of input files is damaged; {todo}") from error
-    changed = sorted(key for key in old.keys() | new.keys() if old.get(key) != new.get(key))
-    if not changed:
-        return
-    states = ("new" if key not in old else "gone" if key not in new else "changed" for key in changed)
-    names = [f"{name} ({state})" for (_, name), state in zip(changed, states, strict=True)]
-    shown = ", ".join(names[:SHOWN]) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
-    raise InputError(f"{told_by}: input files are others {since}, {len(names)} in all: {shown}; {todo}")
+        raise InputError(f"{source}: its list of input files is damaged; {todo}") from error
+    state = dict.fromkeys(old, "gone") | {key: "changed" if key in old else "new" for key in new}
+    changed = [f"{key[1]} ({state[key]})" for key in sorted(state) if old.get(key) != new.get(key)]
+    if changed:
+        shown = ", ".join(changed[:SHOWN]) + (f" and {len(changed) - SHOWN} more" if len(changed) > SHOWN else "")
+        raise InputError(f"{source}: input files are others {since}, {len(changed)} in all: {shown}; {todo}")

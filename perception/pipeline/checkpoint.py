@@ -9,11 +9,9 @@ repeats only what has changed.
     group      optimise, instances.*                                      nothing: it takes seconds
     describe   group, language.*                                          nothing
 
-A run goes on only with the files that it began with (`pipeline.changes`): photos, masks, models and what else settings
-name, by size and time of change. train.time_limit is not part of the dependencies, so that a stopped run can be
-continued with more time. If other optimisation settings have changed, the checkpoint is an error and not discarded, as
-it may be hours of work. With other masks (another labels:DIR), training restarts at the point where masks are first
-used.
+A run goes on only with the files that it began with (`pipeline.changes`). A stopped run can be continued with more
+train.time_limit. If other optimisation settings have changed, the checkpoint is an error and not discarded, as it may
+be hours of work. With other masks (another labels:DIR), training restarts at the point where masks are first used.
 """
 
 from __future__ import annotations
@@ -33,8 +31,9 @@ from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.train import Trainer
 from perception.inputs.readers import EXPECTED
-from perception.io.atomic import atomic_file, writing
+from perception.io.atomic import atomic_file
 from perception.machine import peak_memory_mib
+from perception.map.replace import writing
 from perception.progress import Progress
 
 CHECKPOINT = "checkpoint.pt"
@@ -72,7 +71,7 @@ def digest(*parts: Any) -> str:
 
 
 class TrainingObserver:
-    """Observer of one training run: displays progress, and writes checkpoints to folder `work`.
+    """Displays the progress of one training run, and writes checkpoints to folder `work`.
 
     mark: see `training_mark`. masks: identity of the masks' source. masks_enter: progress up to which the state does
     not depend on masks; the state at that point has its own checkpoint.
@@ -84,6 +83,7 @@ class TrainingObserver:
         self.saved = self.drawn = time.monotonic()
         self.loss: float | None = None
         self.first: tuple[float, int] | None = None
+        """Time and iteration of the first step."""
 
     def take_up(self, trainer: Trainer) -> None:
         """Loads the latest valid checkpoint into `trainer`, if any. InputError when it was made with other settings."""
@@ -105,7 +105,7 @@ class TrainingObserver:
         timed = trainer.iteration > self.first[1]  # the first iteration alone gives no rate
         if (timed and now - self.drawn > DRAWN_SECONDS) or trainer.progress >= 1:
             self.drawn = now
-            self._draw(trainer, now)
+            self._draw(trainer, *self.first)
         if not self.entered and trainer.progress >= self.masks_enter:
             self._save(trainer, BEFORE_MASKS)
             self.entered = True
@@ -121,9 +121,8 @@ class TrainingObserver:
         state = {"masks": masks, "masks_enter": self.masks_enter, "trainer": trainer.state(copy=False)}
         save_checkpoint(self.work / name, state, self.mark)
 
-    def _draw(self, trainer: Trainer, now: float) -> None:
-        assert self.first is not None
-        speed = (trainer.iteration - self.first[1]) / max(now - self.first[0], 1e-6)
+    def _draw(self, trainer: Trainer, since: float, first: int) -> None:
+        speed = (trainer.iteration - first) / max(self.drawn - since, 1e-6)
         total, curve = trainer.expected_iterations, trainer.record.curve
         self.progress.update(
             "train",
@@ -180,14 +179,11 @@ def load_checkpoint(path: Path, mark: str) -> dict[str, Any] | None:
     except (OSError, RuntimeError, ValueError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
         raise InputError(f"{path}: the checkpoint is damaged; delete {path.parent} to start over") from error
     if found != mark:
-        raise InputError(
-            f"{path}: was made with other settings or another input; repeat the first command with --resume, "
-            f"or delete {path.parent} to start over"
-        )
+        todo = f"repeat the first command with --resume, or delete {path.parent} to start over"
+        raise InputError(f"{path}: was made with other settings or another input; {todo}")
     return state
 
 
-WORK_SUFFIX = ".work"
 LEAST_DISK = 256 << 20
 """Least free disk space in bytes, as a small run needs it for features, masks, checkpoint and map."""
 
@@ -202,12 +198,12 @@ def check_name(output: Path) -> None:
 
 def work_folder(output: Path) -> Path:
     """Path of the work folder, a sibling of the map."""
-    return output.with_name(output.name + WORK_SUFFIX)
+    return output.with_name(f"{output.name}.work")
 
 
 def frames_folder(output: Path) -> Path:
     """Folder for the frames of a video, a sibling of the map; it is kept, as the frames are the map's photos."""
-    return output.with_name(output.name + ".frames")
+    return output.with_name(f"{output.name}.frames")
 
 
 @contextmanager
@@ -228,7 +224,7 @@ def working(source: Path, output: Path, resume: bool) -> Iterator[Path]:
                 raise
             raise InputError(f"{work}: the disk is full; free some space and go on with --resume") from error
         except InputError:
-            if fresh and not any(work.rglob(CHECKPOINT)):  # of the whole, or of a block
+            if fresh and not any(work.rglob(CHECKPOINT)):  # also of a block
                 shutil.rmtree(work, ignore_errors=True)
                 if not had_frames:
                     shutil.rmtree(frames_folder(output), ignore_errors=True)
@@ -258,7 +254,6 @@ def _prepare(source: Path, output: Path, resume: bool) -> Path:
     if free < LEAST_DISK:
         if not any(work.iterdir()):
             work.rmdir()
-        raise InputError(
-            f"{output}: the disk has {free >> 20} MiB free, at least {LEAST_DISK >> 20} are needed; free some"
-        )
+        found = f"the disk has {free >> 20} MiB free, at least {LEAST_DISK >> 20} are needed"
+        raise InputError(f"{output}: {found}; free some")
     return work

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from perception.config import MapConfig, load_config
+from perception.config import load_config
 from perception.evaluate.instances import evaluate
-from perception.export.transfer import export_labels, write_export
+from perception.export.export_map import export_labels, write_export
 from perception.geometry import align_similarity, camera_centres
-from perception.io.outputs import check_empty
+from perception.map.outputs import check_empty
 from perception.map.write import Map
 from perception.pipeline.mapping import build_map
 from perception.progress import Progress
@@ -31,14 +31,14 @@ SETTINGS = ["train.iterations=1300", "train.budget=40000"]
 
 @dataclass(frozen=True)
 class DemoTruth:
-    """Ground truth of the scene; it is used to score the map, never to build it. Metres.
+    """Ground truth of the scene, by which the map is scored, never built. Metres.
 
-    asked: the prompts of the demo. queries: every prompt with the ids of what it means. instances: name of each id.
+    prompts: of the demo. queries: every known prompt with the ids of what it means. instances: name of each id.
     centres: camera centre [3] of each photo. points: of the surfaces that two photos see, with normals and colours;
     instance_ids [P] int64: of each point.
     """
 
-    asked: list[str]
+    prompts: list[str]
     queries: dict[str, list[int]]
     instances: dict[int, str]
     centres: dict[str, list[float]]
@@ -64,15 +64,14 @@ def run_demo(output: Path, progress: Progress) -> tuple[dict[str, Any], str]:
     shutil.copytree(SCENE / "photos", photos)
     truth = DemoTruth.read()
 
-    config: MapConfig = load_config(None, SETTINGS)
-    build_map(photos, map_path, config, progress=progress)
+    build_map(photos, map_path, load_config(None, SETTINGS), progress=progress)
     gmap = load_map(map_path)
 
     cloud, scale = truth_in_map_frame(truth, gmap)
     labels = export_labels(gmap.means, gmap.instance_ids, cloud)
     write_export(output / "instances.ply", cloud, labels, {entry["id"]: entry for entry in gmap.instances})
     scored = evaluate(labels, {entry["id"]: entry["score"] for entry in gmap.instances}, truth.instance_ids)
-    queries = [_ask(gmap, text, truth, labels) for text in truth.asked]
+    queries = [_ask(gmap, text, truth, labels) for text in truth.prompts]
     facts = {
         "map": str(map_path),
         "seconds": {"total": round(time.monotonic() - started, 1)},
@@ -90,7 +89,7 @@ def run_demo(output: Path, progress: Progress) -> tuple[dict[str, Any], str]:
     facts["report"] = str(write_map_report(gmap, output / "report.html", [query["text"] for query in queries]))
     from PIL import Image
 
-    Image.fromarray(map_picture(gmap, truth.asked[0])).save(output / "demo.jpg", quality=88)
+    Image.fromarray(map_picture(gmap, truth.prompts[0])).save(output / "demo.jpg", quality=88)
     (output / "demo.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
     return facts, demo_text(facts)
 
@@ -111,19 +110,17 @@ def truth_in_map_frame(truth: DemoTruth, gmap: Map) -> tuple[PointCloud, float]:
 
 def _ask(gmap: QueryMap, text: str, truth: DemoTruth, labels: np.ndarray) -> dict[str, Any]:
     """A prompt, its answer, and whether it is correct: the true object of most points of the first hit is compared."""
-    hits, ids = gmap.query(text, top_k=1), truth.queries.get(text, [])
-    found = None
-    if hits:
-        under = truth.instance_ids[labels == hits[0].instance_id]
-        if len(under):
-            found = int(np.bincount(under).argmax())
+    hit, true = next(iter(gmap.query(text, top_k=1)), None), None
+    if hit is not None and (labels == hit.instance_id).any():
+        true = int(np.bincount(truth.instance_ids[labels == hit.instance_id]).argmax())
+    ids = truth.queries.get(text, [])
     return {
         "text": text,
-        "present": bool(hits),
-        "instance_id": hits[0].instance_id if hits else None,
-        "score": hits[0].score if hits else None,
-        "found": truth.instances.get(found) if found is not None else None,
-        "right": (found in ids) if ids else not hits,
+        "present": hit is not None,
+        "instance_id": None if hit is None else hit.instance_id,
+        "score": None if hit is None else hit.score,
+        "found": None if true is None else truth.instances.get(true),
+        "right": true in ids if ids else hit is None,
     }
 
 

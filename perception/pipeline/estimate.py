@@ -44,7 +44,7 @@ def largest_budget(limit: int | None) -> int | None:
 
 
 def log_estimate(source: Path, config: MapConfig, log: Callable[[str], None]) -> None:
-    """Passes the estimate for the input `source` to `log` as one line; InputError if memory is not sufficient."""
+    """Logs the estimate for the input `source` as one line; InputError if memory is not sufficient."""
     photos = photo_sizes(source)
     if photos.sizes:
         needed = check_memory(photos, config)
@@ -57,7 +57,7 @@ def check_memory(photos: PhotoSizes, config: MapConfig, limit: int | None = None
     limit None: the memory available to this process; nothing is checked if that is unknown.
     """
     limit = memory_limit() if limit is None else limit
-    count, block = len(photos.sizes), config.train.block_photos  # a block at a time, in a large place
+    count, block = len(photos.sizes), config.train.block_photos  # a block at a time, in a large scene
     budget = sized(config, min(count, block) if block else count, largest_budget(limit)).train.budget
     side = config.photos.max_side
     memory = image_memory(config, limit)
@@ -67,7 +67,7 @@ def check_memory(photos: PhotoSizes, config: MapConfig, limit: int | None = None
     smaller = [(max(64, int(side * share)), max(1000, int(budget * share))) for share in (0.75, 0.5, 0.35, 0.2, 0.1)]
     fitting = next((pair for pair in smaller if needed_bytes(photos, *pair, memory) <= limit), None)
     advice = "give fewer or smaller photos, or use a machine with more memory"
-    raise InputError(
-        f"{photos.what} need about {needed / 2**30:.1f} GiB with --max-side {side} --budget {budget}, and there are "
-        f"{limit / 2**30:.1f}; " + (f"give --max-side {fitting[0]} --budget {fitting[1]}" if fitting else advice)
-    )
+    if fitting is not None:
+        advice = f"give --max-side {fitting[0]} --budget {fitting[1]}"
+    found = f"need about {needed / 2**30:.1f} GiB with --max-side {side} --budget {budget}"
+    raise InputError(f"{photos.what} {found}, and there are {limit / 2**30:.1f}; {advice}")

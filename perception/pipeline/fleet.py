@@ -62,7 +62,8 @@ def read_jobs(file: Path) -> list[dict[str, Any]]:
         if not os.path.exists(source):  # noqa: PTH110 - Path.exists raises for a long name
             raise InputError(f"{where}: {source} does not exist")
         # One folder has one inode, whatever its spelling or mount. Names that differ in case may be one name there.
-        above, name = _standing(output)
+        above = next(path for path in (output, *output.parents) if os.path.exists(path))  # noqa: PTH110
+        name = output.relative_to(above).as_posix()
         known = outputs.setdefault((above.stat().st_dev, above.stat().st_ino, name.casefold()), {})
         if other := known.get(name) or next((known[one] for one in known if _ignores_case(above)), None):
             raise InputError(f"{where}: has the output of job {other}, {output}")
@@ -70,12 +71,6 @@ def read_jobs(file: Path) -> list[dict[str, Any]]:
         config = load_config(settings, pairs, job.preset)
         jobs.append({"input": str(source), "output": str(output), "settings": config.to_json()})
     return jobs
-
-
-def _standing(path: Path) -> tuple[Path, str]:
-    """The nearest place above `path` that exists, or itself, and the names below it."""
-    there = next(place for place in (path, *path.parents) if os.path.exists(place))  # noqa: PTH110
-    return there, path.relative_to(there).as_posix()
 
 
 def _ignores_case(folder: Path) -> bool:
@@ -90,13 +85,13 @@ def _ignores_case(folder: Path) -> bool:
 def map_one(task: str, progress: Progress = QUIET) -> dict[str, Any]:
     """Makes the map of one job. An error of any class is in its result, so that the other maps are made."""
     job = json.loads(task)
-    told = {"input": job["input"], "output": job["output"]}
+    row = {"input": job["input"], "output": job["output"]}
     try:
         config = MapConfig.model_validate(job["settings"])
         build_map(Path(job["input"]), Path(job["output"]), config, resume=True, progress=progress)
         info = write_own_report(Path(job["output"]), progress)
-        return {**told, "seconds": info["seconds"]["total"], "instances": info["num_instances"]}
+        return {**row, "seconds": info["seconds"]["total"], "instances": info["num_instances"]}
     except InputError as error:
-        return {**told, "error": " ".join(str(error).split())}
+        return {**row, "error": " ".join(str(error).split())}
     except Exception as error:
-        return {**told, "error": f"{type(error).__name__}: {brief(error, 400)}"}
+        return {**row, "error": f"{type(error).__name__}: {brief(error, 400)}"}

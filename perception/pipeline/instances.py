@@ -35,15 +35,15 @@ HALVED_FROM = 480
 
 
 @dataclass
-class FoundInstances:
-    """ids [N] int32 (−1 = none), membership [N] float32, instances.json's list, language arrays, facts, and the
-    arrays of parts.npz and groups.npz (see io.store)."""
+class DescribedInstances:
+    """ids [N] int32 (−1 = none), membership [N] float32, instances.json's list, facts for map.json, and the arrays of
+    language.npz, parts.npz and groups.npz (see `map.write`)."""
 
     ids: np.ndarray
     membership: np.ndarray
     instances: list[dict[str, Any]] = field(default_factory=list)
-    language: dict[str, np.ndarray] = field(default_factory=dict)
     report: dict[str, Any] = field(default_factory=dict)
+    language: dict[str, np.ndarray] = field(default_factory=dict)
     parts: dict[str, np.ndarray] = field(default_factory=dict)
     groups: dict[str, np.ndarray] = field(default_factory=dict)
 
@@ -51,63 +51,41 @@ class FoundInstances:
 def group_gaussians(optimised: Optimised, run: Run, segments: Segmentation | None) -> Grouping | None:
     """Groups Gaussians into instances by features and votes of all masks (§3.2.1); None if no photo has masks.
     segments: of the surface, if the masks come from one."""
-    with run.stage("instances"):
-        return _group(optimised.nearby, optimised.photos.views, run, segments)
-
-
-def _group(nearby: Nearby, views: list[TrainingView], run: Run, segments: Segmentation | None) -> Grouping | None:
+    nearby, views, config = optimised.nearby, optimised.photos.views, run.config
     if not any(view.labels is not None and bool((view.labels > 0).any()) for view in views):
         return None
-    config = run.config
     run.progress.log(f"grouping {len(nearby.gaussians)} Gaussians")
     return_free_memory()
     half = config.losses.half_resolution
     votes = mask_votes(nearby, views, half_resolution=half, progress=run.progress, keep=run.new_keep())
     gaussians = nearby.gaussians.to("cpu")
-    found = group(
-        gaussians.means.detach().numpy(),
-        gaussians.scales.detach().numpy(),
-        gaussians.opacities.detach().numpy(),
-        gaussians.features.detach().numpy(),
-        votes,
-        config.instances,
-        margin=config.losses.margin,
-        seed=config.seed,
-    )
-    return found if segments is None else with_levels(found, gaussians.means.detach().numpy(), votes, segments)
+    tensors = (gaussians.means, gaussians.scales, gaussians.opacities, gaussians.features)
+    means, scales, opacities, features = (tensor.detach().numpy() for tensor in tensors)
+    margin = config.losses.margin
+    grouping = group(means, scales, opacities, features, votes, config.instances, margin=margin, seed=config.seed)
+    return grouping if segments is None else with_levels(grouping, means, votes, segments)
 
 
 def describe(
     optimised: Optimised, grouped: Grouping | None, run: Run, encoder: Encoder | None, reader: TextReader | None
-) -> FoundInstances:
+) -> DescribedInstances:
     """Geometry, score and views of each instance; with an encoder its language embeddings (§3.2.2), with a reader its
     printed texts."""
-    with run.stage("instances"):
-        return _describe(optimised.nearby, grouped, optimised.photos.views, run, encoder, reader)
-
-
-def _describe(
-    nearby: Nearby,
-    grouped: Grouping | None,
-    views: list[TrainingView],
-    run: Run,
-    encoder: Encoder | None,
-    reader: TextReader | None,
-) -> FoundInstances:
-    count, words, progress = len(nearby.gaussians), run.config.language, run.progress
+    nearby, views, language, progress = optimised.nearby, optimised.photos.views, run.config.language, run.progress
+    count = len(nearby.gaussians)
     if grouped is None:
         report = {"warnings": ["no photo has masks"]}
-        return FoundInstances(np.full(count, -1, np.int32), np.zeros(count, np.float32), report=report)
-    local = np.where(grouped.part_ids >= 0, grouped.part_ids - grouped.count, -1).astype(np.int32)
-    together = np.append(grouped.groups, -1).astype(np.int32)
-    levels = [grouped.ids, local, together[grouped.ids] if len(grouped.group_scores) else np.full_like(local, -1)]
+        return DescribedInstances(np.full(count, -1, np.int32), np.zeros(count, np.float32), report=report)
+    part = np.where(grouped.part_ids >= 0, grouped.part_ids - grouped.count, -1).astype(np.int32)
+    group_of = np.append(grouped.groups, -1).astype(np.int32)  # the last for Gaussians without an instance
+    levels = [grouped.ids, part, group_of[grouped.ids] if len(grouped.group_scores) else np.full_like(part, -1)]
     seen, parts_seen, groups_seen = _silhouettes(nearby, levels, views, progress) if grouped.count else ([], [], [])
-    found = FoundInstances(grouped.ids, grouped.membership, _entries(grouped, nearby.gaussians.to("cpu"), seen))
+    described = DescribedInstances(grouped.ids, grouped.membership, _entries(grouped, nearby.gaussians.to("cpu"), seen))
     if reader is not None and grouped.count:
-        choices = _best_views(grouped.ids, seen, words.views)
+        choices = _best_views(grouped.ids, seen, language.views)
         # The networks of the copy are freed with it, before the encoder needs as much memory.
         texts = read_texts(copy(reader), choices, lambda n: _shown(views[n], seen[n]), progress)
-        store_texts(found.instances, texts)
+        store_texts(described.instances, texts)
         return_free_memory()
 
     def embedded(ids: np.ndarray, seen: list[Silhouettes], best: int, zooms: int) -> dict[str, np.ndarray]:
@@ -120,22 +98,21 @@ def _describe(
         return to_arrays(shown, encoder.identity)
 
     if grouped.count:
-        found.language = embedded(grouped.ids, seen, words.views, words.zooms)
+        described.language = embedded(grouped.ids, seen, language.views, language.zooms)
     if grouped.parents:  # a crop of the best view of each
-        found.parts = {"ids": grouped.part_ids, **prefixed(embedded(local, parts_seen, 1, 1))}
+        described.parts = {"ids": grouped.part_ids, **prefixed(embedded(part, parts_seen, 1, 1))}
     if len(grouped.group_scores):
-        language = prefixed(embedded(levels[2], groups_seen, 1, 1))
-        found.groups = {"of": together[:-1], "scores": grouped.group_scores, **language}
-    found.report = {
+        arrays = prefixed(embedded(levels[2], groups_seen, 1, 1))
+        described.groups = {"of": group_of[:-1], "scores": grouped.group_scores, **arrays}
+    described.report = {
         "count": grouped.count,
         "parts": len(grouped.parents),
-        "groups": len(found.groups.get("scores", ())),
+        "groups": len(grouped.group_scores),
         "noise_share": float(np.mean(grouped.ids < 0)) if count else 0.0,
-        "encoder": str(found.language["encoder"]) if found.language else None,
+        "encoder": str(described.language["encoder"]) if described.language else None,
+        **({} if reader is None else {"texts": reader.identity}),
     }
-    if reader is not None:
-        found.report["texts"] = reader.identity
-    return found
+    return described
 
 
 def _silhouettes(

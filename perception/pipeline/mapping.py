@@ -5,7 +5,6 @@ Section (§) and equation numbers are the paper's (Piekenbrinck et al. 2025).
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from perception.errors import InputError
 from perception.frame.recentre import recentred
 from perception.frame.world_frame import in_world_frame
 from perception.gaussians.device import choose_device
-from perception.gaussians.model import Gaussians
 from perception.gaussians.photos import split_scene
 from perception.inputs.load import load_scene
 from perception.language.base import Encoder
@@ -29,18 +27,18 @@ from perception.masks import MaskSource, make_source
 from perception.masks.compute import load_segmentation
 from perception.photos.scene_file import load_saved_scene, save_scene
 from perception.photos.view_json import stored_view
-from perception.pipeline.blocks import optimiser
+from perception.pipeline.blocks import optimise_scene
 from perception.pipeline.changes import hold_inputs, inputs_of, refuse_changed
 from perception.pipeline.checkpoint import check_name, clear_work, fingerprint, frames_folder, poses_mark, working
 from perception.pipeline.estimate import log_estimate
-from perception.pipeline.instances import FoundInstances, describe, group_gaussians
-from perception.pipeline.optimise import Run
+from perception.pipeline.instances import DescribedInstances, describe, group_gaussians
+from perception.pipeline.optimise import Optimised, Run
 from perception.pipeline.record import finite, run_record, scored
 from perception.progress import QUIET, Progress
 from perception.report.text import depth_text, frame_lines
 from perception.sfm.options import ReadOptions
 from perception.tasks.engine import LOCAL, Engine
-from perception.types import Scene, View
+from perception.types import Scene
 
 
 def build_map(
@@ -57,17 +55,14 @@ def build_map(
     Raises InputError for bad input. What a run has made is kept beside `output` until the map is written; `resume` goes
     on from there (see `pipeline.checkpoint`), or returns a finished map. engine: where tasks run.
 
-    >>> from perception.config import load_config
-    >>> config = load_config(pairs=["masks=labels:table/labels", "train.iterations=20", "language.encoder=none"])
+    >>> config = MapConfig(masks="labels:table/labels", train={"iterations": 20}, language={"encoder": "none"})
     >>> gmap = build_map(Path("table"), Path("table.gsmap"), config)
     >>> len(gmap.views), gmap.means.shape == (len(gmap), 3)
     (12, True)
     """
-    started = time.monotonic()
     check_name(output)
-    if resume and _is_finished(source, output, config):
-        return _finished(output, progress)
-
+    if resume and (finished := _finished(source, output, config, progress)) is not None:
+        return finished
     with working(source, output, resume) as work:
         # Files, models and devices are opened first, so that errors appear before hours of work.
         hold_inputs(work, source, config, output)
@@ -76,21 +71,18 @@ def build_map(
 
         # Posed images I_v (§3.2) and a sparse cloud.
         scene = _posed_scene(output, run)
-        inputs = hold_inputs(work, source, config, output)  # the frames of a video among them
         scene, training, held_out = split_scene(scene, config.photos)
 
         # Masks M_v,i of every photo (§3.2), and Gaussians optimised on photos and masks (§3.1 to 3.2.3).
-        optimised = optimiser(scene, config.train.block_photos)(run, scene, training, held_out, masks)
+        optimised = optimise_scene(run, scene, training, held_out, masks)
         segments = load_segmentation(run.masks) if masks.needs_depth else None
         del masks  # with its images
 
         # Group the Gaussians by their features into instances (§3.2.1), describe these from their best views (§3.2.2).
-        grouped = group_gaussians(optimised, run, segments)
-        found = describe(optimised, grouped, run, encoder, reader)
-
-        gaussians, quality = scored(run, optimised, scene.metric)
-        info = run_record(run, scene, optimised, found.report, quality, time.monotonic() - started)
-        gmap = _assemble(gaussians, found, scene, held_out, {**info, "inputs": inputs}, output)
+        with run.stage("instances"):
+            grouped = group_gaussians(optimised, run, segments)
+            described = describe(optimised, grouped, run, encoder, reader)
+        gmap = _assemble(run, scene, optimised, described, output)
         write_map(output, gmap, fresh=True)
     _log_result(gmap, output, progress)
     return gmap
@@ -99,24 +91,20 @@ def build_map(
 # ----------------------------------------------------------------------- stages
 
 
-def _is_finished(source: Path, output: Path, config: MapConfig) -> bool:
-    """Whether a map of this input and these settings lies at `output`. InputError when the input has changed since."""
+def _finished(source: Path, output: Path, config: MapConfig, progress: Progress) -> Map | None:
+    """The finished map of this input and these settings, if any. InputError when the input has changed since."""
     if not is_map(output) or (info := read_info(output)).get("fingerprint") != fingerprint(source, config):
-        return False
+        return None
     refuse_changed(output, info, inputs_of(source, config, output))
-    return True
-
-
-def _finished(output: Path, progress: Progress) -> Map:
     progress.log(f"{output}: this run is finished")
     clear_work(output)
     return read_map(output)
 
 
 def _open_run(source: Path, config: MapConfig, work: Path, progress: Progress, engine: Engine) -> Run:
-    device, line = choose_device(config.device)
-    if line is not None:
-        progress.log(line)
+    device, notice = choose_device(config.device)
+    if notice is not None:
+        progress.log(notice)
     return Run(source, config, work, work / "masks", device, progress, engine)
 
 
@@ -143,52 +131,36 @@ def _posed_scene(output: Path, run: Run) -> Scene:
         scene = load_saved_scene(kept)
         if scene is None:
             log_estimate(source, config, progress.log)
-            photos, frames = config.photos, frames_folder(output)
-            masks, camera, cloud = (
-                Path(p) if p else None for p in (photos.ignore_masks, photos.camera, photos.init_points)
-            )
-            options = ReadOptions(
-                work / "sfm",
-                config.seed,
-                progress,
-                photos.strict,
-                masks,
-                camera,
-                frames,
-                cloud,
-                photos.poses,
-                run.engine,
-            )
-            scene = load_scene(source, options)
+            photos = config.photos
+            files = (photos.ignore_masks, photos.camera, photos.init_points)
+            masks, camera, cloud = (Path(file) if file else None for file in files)
+            options = ReadOptions(work / "sfm", config.seed, progress, photos.strict, masks, camera)
+            options = replace(options, frames=frames_folder(output), init_points=cloud, poses=photos.poses)
+            scene = load_scene(source, replace(options, engine=run.engine))
             save_scene(kept, scene := in_world_frame(recentred(scene), config.frame, config.seed))
         if config.losses.depth_weight == 0:
             scene = replace(scene, views=[replace(view, depth=None) for view in scene.views])
+    run.inputs = hold_inputs(work, source, config, output)  # the frames of a video among them
     _log_scene(scene, progress)
     return scene
 
 
-def _assemble(
-    gaussians: Gaussians,
-    found: FoundInstances,
-    scene: Scene,
-    held_out: list[View],
-    record: dict[str, Any],
-    output: Path,
-) -> Map:
-    """The map to write; in JSON values, None replaces NaN and infinity."""
-    held = {view.name: view for view in held_out}
+def _assemble(run: Run, scene: Scene, optimised: Optimised, described: DescribedInstances, output: Path) -> Map:
+    """The map to write, scored in its held-out views; in JSON values, None replaces NaN and infinity."""
+    gaussians, quality = scored(run, optimised, scene.metric)
+    held = {view.name: view for view in optimised.photos.held_out}
     arrays: dict[str, Any] = {name: tensor.detach().numpy() for name, tensor in gaussians.named().items()}
     arrays["quats"] = arrays["quats"] / np.maximum(np.linalg.norm(arrays["quats"], axis=1, keepdims=True), 1e-12)
     return Map(
         **arrays,
-        instance_ids=found.ids,
-        membership=found.membership,
-        instances=finite(found.instances),
-        info=finite(record),
+        instance_ids=described.ids,
+        membership=described.membership,
+        instances=finite(described.instances),
+        info=finite(run_record(run, scene, optimised, described.report, quality)),
         views=[stored_view(held.get(view.name, view), output, view.name in held) for view in scene.views],
-        language=found.language,
-        parts=found.parts,
-        groups=found.groups,
+        language=described.language,
+        parts=described.parts,
+        groups=described.groups,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
@@ -41,7 +42,8 @@ PHOTOS_A_TASK = 8
 @dataclass
 class Run:
     """What every stage of a run needs. source: the input; work: its folder of intermediate results; masks: the folder
-    of label images; engine: where tasks run; seconds: of each stage so far."""
+    of label images; engine: where tasks run; seconds: of each stage so far; inputs: the files that the map is made from
+    (see `pipeline.changes`); started: monotonic time."""
 
     source: Path
     config: MapConfig
@@ -51,13 +53,15 @@ class Run:
     progress: Progress
     engine: Engine = field(default_factory=Engine)
     seconds: dict[str, float] = field(default_factory=dict)
+    inputs: dict[str, dict[str, str]] = field(default_factory=dict)
+    started: float = field(default_factory=time.monotonic)
 
     def __post_init__(self) -> None:
         self._arrays = DiskArrays(self.work, image_memory(self.config, memory_limit()))
         self.keep: Keep = self._arrays.keep
 
     def new_keep(self) -> Keep:
-        """A place for arrays that fill what those of `keep` leave of `photos.memory`; it goes with the last of them."""
+        """Keeps arrays in what those of `keep` leave of `photos.memory`, until the last of them is freed."""
         return DiskArrays(self.work, 2 * self._arrays.most, self._arrays).keep
 
     def stage(self, name: str) -> AbstractContextManager[None]:
@@ -87,16 +91,11 @@ class Photos:
             views = load_all(training, side, run.progress, run.keep)
             return cls(training, held_out, views, load_all(held_out, side, run.progress, run.keep))
 
-    def labelled(self, folder: Path) -> Photos:
-        """The same photos, those of `views` with their label images in `folder`."""
-        pairs = zip(self.views, self.training, strict=True)
-        return replace(self, views=[with_labels(decoded, view, folder) for decoded, view in pairs])
-
 
 @dataclass(frozen=True)
 class Optimised:
-    """What training gives: the Gaussians, the photos with their labels, the training's record, the report of the masks,
-    and a report of each block of a large scene."""
+    """The Gaussians, the photos with their labels, the training's record, the report of the masks, and a report of
+    each block of a large scene."""
 
     nearby: Nearby
     photos: Photos
@@ -113,10 +112,8 @@ def optimise(
     source: MaskSource,
     box: np.ndarray | None = None,
 ) -> Optimised:
-    """Trains the Gaussians of a scene, or of the block of one that owns `box` (see `Trainer`).
-
-    Goes on from the checkpoint in `run.work`, if there is one.
-    """
+    """Trains the Gaussians of a scene, or of the block of one that owns `box` (see `Trainer`), from the checkpoint in
+    `run.work` on, if there is one."""
     label_by_tasks(run, training, source)
     photos = Photos.load(run, training, held_out)
     config = sized(run.config, len(photos.views), largest_budget(memory_limit()))
@@ -166,10 +163,9 @@ def label_by_tasks(run: Run, views: Sequence[View], source: MaskSource) -> None:
         return
     folders = []
     for start in range(0, len(views), PHOTOS_A_TASK):
-        some = list(views[start : start + PHOTOS_A_TASK])
-        folders.append(run.work / f"labels-{digest(run.mark, source.identity, [view.name for view in some])}")
+        scene = Scene(list(views[start : start + PHOTOS_A_TASK]), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+        folders.append(run.work / f"labels-{digest(run.mark, source.identity, [view.name for view in scene.views])}")
         if not has_task(folders[-1]):
-            scene = Scene(some, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
             write_task(folders[-1], scene, config=run.config.to_json(), masks=str(run.masks.resolve()))
     with run.stage("masks"):
         run.engine.run(label_task, [str(folder.resolve()) for folder in folders], "photo set", run.progress)
@@ -206,4 +202,6 @@ def label_photos(
         )
         for warning in report["warnings"]:
             run.progress.log(f"warning: {warning}")
-        return photos.labelled(run.masks), report
+        pairs = zip(photos.views, photos.training, strict=True)
+        labelled = [with_labels(decoded, view, run.masks) for decoded, view in pairs]
+        return replace(photos, views=labelled), report

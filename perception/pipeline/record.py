@@ -1,8 +1,9 @@
-"""What map.json holds of a run: settings, times, memory, and how good it is in views held out of training."""
+"""The record of a run in map.json: settings, times, memory, and quality in views held out of training."""
 
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import asdict
 from typing import Any
 
@@ -17,6 +18,11 @@ from perception.pipeline.optimise import Optimised, Run
 from perception.tasks.folder import versions
 from perception.types import Scene
 
+CLOSE_METRES, CLOSE_SHARE = 0.05, 0.025
+"""Errors that count as close: in metres, or relative to the depth where the unit is not known to be the metre."""
+FRAME_FACTS = ("map_from_input", "scale", "gravity")
+"""Entries of a scene's report that map.json holds at its top level."""
+
 
 def finite(value: Any) -> Any:
     """JSON-able `value` with None for every float that is NaN or infinite, which JSON cannot hold."""
@@ -27,19 +33,11 @@ def finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-CLOSE_METRES, CLOSE_SHARE = 0.05, 0.025
-"""Errors that count as close: in metres, or relative to the depth where the unit is not known to be the metre."""
-
-
-FRAME_FACTS = ("map_from_input", "scale", "gravity")
-"""Entries of a scene's report that map.json holds at its top level."""
-
-
 def run_record(
-    run: Run, scene: Scene, optimised: Optimised, instances: dict[str, Any], quality: dict[str, Any], seconds: float
+    run: Run, scene: Scene, optimised: Optimised, instances: dict[str, Any], quality: dict[str, Any]
 ) -> dict[str, Any]:
-    """The facts of map.json but for its views and files. instances: report of grouping and description; seconds: of
-    the run in all."""
+    """The facts of map.json but for its views and files. instances: report of grouping and description."""
+    seconds = {**run.seconds, "total": time.monotonic() - run.started}
     facts = {
         "frame": scene.frame,
         "metric": scene.metric,
@@ -55,14 +53,14 @@ def run_record(
         "training": asdict(optimised.record),
         "instances": instances,
         "quality": quality,
-        "seconds": {name: round(s, 2) for name, s in (*run.seconds.items(), ("total", seconds))},
+        "seconds": {name: round(value, 2) for name, value in seconds.items()},
         "peak_memory_mib": peak_memory_mib(),
     }
-    return facts | ({"blocks": optimised.blocks} if optimised.blocks else {})
+    return facts | ({"blocks": optimised.blocks} if optimised.blocks else {}) | {"inputs": run.inputs}
 
 
 def scored(run: Run, optimised: Optimised, metric: bool) -> tuple[Gaussians, dict[str, Any]]:
-    """The Gaussians on the CPU, and how good they are in the held-out views."""
+    """The Gaussians on the CPU, and their quality in the held-out views."""
     with run.stage("score"):
         gaussians = optimised.nearby.gaussians.to("cpu")
         return gaussians, score_views(gaussians, optimised.photos.held, metric)
@@ -77,8 +75,8 @@ def score_views(gaussians: Gaussians, views: list[TrainingView], metric: bool = 
     for view in views:
         image = render_view(gaussians, view)
         weight = None if view.weight is None else view.weight.numpy()
-        similarity = ssim(image.numpy().astype(np.float64), view.photo.numpy().astype(np.float64) / 255, weight)
-        per_view[view.name] = {"psnr": psnr(image, view.photo, view.weight), "ssim": float(similarity)}
+        similarity = ssim(image.numpy(), view.photo.numpy().astype(np.float64) / 255, weight)
+        per_view[view.name] = {"psnr": psnr(image, view.photo, view.weight), "ssim": similarity}
     if not per_view:
         return {"views": {}}
     means = {name: float(np.mean([entry[name] for entry in per_view.values()])) for name in ("psnr", "ssim")}

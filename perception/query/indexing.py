@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.atomic import atomic_file, recover, writing
+from perception.io.atomic import atomic_file, recover
 from perception.language.encoders import make_encoder
 from perception.map.checksums import FACTS, STORE
+from perception.map.replace import writing
 from perception.progress import QUIET, Progress
 from perception.query.map_store import FORMAT_VERSION, TOLD, read_store
 from perception.query.query_map import QueryMap, load_map
@@ -122,7 +123,7 @@ def _indexed(store: Path, gmap: QueryMap, facts: dict[str, Any]) -> dict[str, An
     file = hashlib.sha256(key.encode()).hexdigest()[:32] + ".npz"
     if not (store / "maps" / file).is_file():
         arrays = _arrays(gmap)
-        with atomic_file(store / "maps" / file) as aside, aside.open("wb") as stream:
+        with atomic_file(store / "maps" / file, parents=True) as aside, aside.open("wb") as stream:
             np.savez(stream, **arrays)  # type: ignore[arg-type]
     written = datetime.fromtimestamp((path / FACTS).stat().st_mtime, timezone.utc).isoformat(timespec="seconds")
     entry = {"map": str(path), "map_id": gmap.map_id, "frame": gmap.frame, "metric": gmap.metric, "written": written}

@@ -219,7 +219,7 @@ def write_graph(gmap: Map, path: Path) -> tuple[dict[str, Any], str]:
     import networkx
 
     graph = scene_graph(gmap)
-    with atomic_file(path) as aside:
+    with atomic_file(path, parents=True) as aside:
         aside.write_text(json.dumps(networkx.node_link_data(graph, edges="edges"), indent=1), encoding="utf-8")
     kinds = Counter(kind for _, kind in graph.nodes(data="kind"))
     relations = Counter(relation for _, _, relation in graph.edges(data="relation"))

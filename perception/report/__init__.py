@@ -1,1 +1,1 @@
-"""A finished map in words and as a page."""
+"""A finished map as text and as a page."""

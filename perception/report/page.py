@@ -68,10 +68,7 @@ def write_map_report(opened: QueryMap, path: Path, queries: list[str]) -> Path:
         "warnings": _warnings(info, album.scored),
         "settings": dict(flat(info.get("config", {}))),
     }
-    try:
-        return write_page(path, data)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+    return write_page(path, data)
 
 
 def write_page(path: Path, data: Mapping[str, Any]) -> Path:
@@ -91,7 +88,7 @@ def write_page(path: Path, data: Mapping[str, Any]) -> Path:
         page = text.encode(errors="replace")  # an unpaired surrogate in a file name cannot be encoded as UTF-8
         if len(page) < LIMIT:
             break
-    with atomic_file(path) as aside:
+    with atomic_file(path, parents=True) as aside:
         aside.write_bytes(page)
     return path
 
@@ -119,8 +116,8 @@ def clock(seconds: float) -> str:
     """42.3 -> 42 s, 95 -> 1 min 35 s."""
     if seconds < 9.95:
         return f"{seconds:.1f} s"
-    whole = round(seconds)
-    return f"{whole} s" if whole < 60 else f"{whole // 60} min {whole % 60:02d} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
 
 
 def _warnings(info: dict[str, Any], scored: dict[str, dict[str, float]]) -> list[str]:
@@ -156,6 +153,7 @@ class _Album:
 
     def __init__(self, gmap: Map):
         self.gmap, self.gaussians = gmap, as_gaussians(gmap)
+        self.side = gmap.setting("photos", "max_side", MAX_SIDE)
         self.views = {view.name: view for view in gmap.views}
         figures = gmap.info.get("quality", {}).get("views", {})
         self.scored = {name: own for name, own in figures.items() if name in self.views and None not in own.values()}
@@ -164,8 +162,7 @@ class _Album:
     def _photo(self, name: str) -> np.ndarray | None:
         """[h, w, 3] uint8; None when it can no longer be read, or is none of the map's."""
         try:
-            view = self.gmap.with_photo(self.views[name])
-            return load_photo(view, self.gmap.setting("photos", "max_side", MAX_SIDE))
+            return load_photo(self.gmap.with_photo(self.views[name]), self.side)
         except (InputError, KeyError):
             return None
 
@@ -174,7 +171,7 @@ class _Album:
         view, photo = self.views[name], self.photo(name)
         assert photo is not None  # see the class
         height, width = photo.shape[:2]
-        pose, K = view.camera_from_world.astype(np.float32), scaled_K(view, width, height).astype(np.float32)
+        pose, K = (array.astype(np.float32) for array in (view.camera_from_world, scaled_K(view, width, height)))
         return torch.from_numpy(pose), torch.from_numpy(K), width, height
 
     def render(self, name: str) -> np.ndarray:
@@ -207,7 +204,7 @@ def map_picture(opened: QueryMap, text: str) -> np.ndarray:
         raise InputError(f"{album.views[name].photo}: cannot be read any more; the picture needs the photo")
     ids = album.ids(name)
     answer = outline(photo, ids == hits[0].instance_id) if hits else photo
-    titles = ["photo", "the map from the same place", "instances", f'"{text}"']
+    titles = ["photo", "the map from the same camera", "instances", f'"{text}"']
     return titled_row([photo, album.render(name), overlay(photo, ids), answer], titles)
 
 
@@ -228,18 +225,18 @@ def _view_rows(album: _Album) -> list[dict[str, np.ndarray]]:
     """{caption: image} of the held-out views in SHOWN: the photo, the render, their difference."""
     scored = album.scored
     by_psnr = sorted(scored, key=lambda name: float(scored[name]["psnr"]))
-    places = dict.fromkeys((0, len(by_psnr) // 2, len(by_psnr) - 1) if by_psnr else ())
+    chosen = dict.fromkeys(by_psnr[i] for i in (0, len(by_psnr) // 2, -1) if by_psnr)
     rows = []
-    for place, rank in zip(places, SHOWN, strict=False):
-        name = by_psnr[place]
+    for name, rank in zip(chosen, SHOWN, strict=False):
         photo = album.photo(name)
         if photo is None:
             continue
         render, note = album.render(name), f", {rank} of {len(by_psnr)}" if len(by_psnr) > 1 else ""
+        figures = f"{scored[name]['psnr']:.2f} dB, SSIM {scored[name]['ssim']:.3f}"
         rows.append(
             {
                 f"photo {name}, not used for the map": photo,
-                f"render: {scored[name]['psnr']:.2f} dB, SSIM {scored[name]['ssim']:.3f}{note}": render,
+                f"render: {figures}{note}": render,
                 "error: black is none, bright is a quarter of the range": error_map(photo, render),
             }
         )
@@ -259,19 +256,14 @@ def _overview(gmap: Map, album: _Album) -> dict[str, np.ndarray]:
     }
 
 
-def _best_crop(opened: QueryMap, index: int, album: _Album, whole: bool) -> np.ndarray | None:
-    """The instance in the photo that shows it best: outlined in the whole photo, or cut out with a margin."""
+def _best_picture(opened: QueryMap, index: int, album: _Album, cropped: bool) -> np.ndarray | None:
+    """The photo that shows the instance best, with its outline; cropped: cut out with a margin. None without one."""
     hit = opened.hit(index)
-    if not hit.views:
-        return None
-    photo = album.photo(hit.views[0])
-    if photo is None:
-        return None
-    mask = album.ids(hit.views[0]) == hit.instance_id
-    if not mask.any():
+    photo = album.photo(hit.views[0]) if hit.views else None
+    if photo is None or not (mask := album.ids(hit.views[0]) == hit.instance_id).any():
         return None
     picture = outline(photo, mask)
-    if whole:
+    if not cropped:
         return picture
     x0, y0, x1, y1 = expand_box(mask_box(mask) or (0, 0, *mask.shape[::-1]), 0.15, *mask.shape[::-1])
     return picture[y0:y1, x0:x1]
@@ -283,7 +275,7 @@ def _instance_rows(opened: QueryMap, album: _Album) -> list[dict[str, Any]]:
     return [
         {
             "id": entry["id"],
-            "crop": _best_crop(opened, i, album, whole=False),
+            "crop": _best_picture(opened, i, album, cropped=True),
             "label": entry.get("label"),
             "names": printed_texts(entry)[:2] + names[i],
             "score": entry["score"],
@@ -296,5 +288,5 @@ def _instance_rows(opened: QueryMap, album: _Album) -> list[dict[str, Any]]:
 
 def _query_row(opened: QueryMap, text: str, album: _Album) -> dict[str, Any]:
     hits = opened.query(text)
-    picture = _best_crop(opened, opened.position(hits[0].instance_id), album, whole=True) if hits else None
+    picture = _best_picture(opened, opened.position(hits[0].instance_id), album, cropped=False) if hits else None
     return {"text": text, "hits": [(hit.instance_id, hit.score) for hit in hits], "picture": picture}

@@ -13,27 +13,22 @@ from perception.query import Hit, QueryMap
 
 def map_facts(path: Path | str, info: dict[str, Any]) -> dict[str, Any]:
     """The JSON output of `perception map`; info: content of map.json."""
-    scene = info["scene"]
+    training = info["training"]
     return {
         "map": str(path),
         "gaussians": info["num_gaussians"],
         "instances": info["num_instances"],
-        "quality": info["quality"],
-        "seconds": info["seconds"],
-        "peak_memory_mib": info["peak_memory_mib"],
-        "iterations": info["training"]["iterations"],
-        "profile": shares(info["training"]),
-        "decisions": info["training"]["decisions"],
-        "scene": scene,
+        **{key: info[key] for key in ("quality", "seconds", "peak_memory_mib", "scene")},
+        **{key: training[key] for key in ("iterations", "decisions")},
+        "profile": shares(training),
     }
 
 
 def shares(training: dict[str, Any]) -> dict[str, float]:
     """Share of the training time of each part, largest first; "other" is the unattributed rest."""
-    total = max(training.get("seconds", 0.0), 1e-9)
-    parts = dict(training.get("profile", {}))
-    parts["other"] = max(0.0, total - sum(parts.values()))
-    return {name: round(parts[name] / total, 4) for name in sorted(parts, key=lambda name: -parts[name])}
+    total, parts = max(training.get("seconds", 0.0), 1e-9), training.get("profile", {})
+    parts = {**parts, "other": max(0.0, total - sum(parts.values()))}
+    return {name: round(seconds / total, 4) for name, seconds in sorted(parts.items(), key=lambda part: -part[1])}
 
 
 SHARP, BLURRED = 25.0, 20.0
@@ -61,24 +56,21 @@ def info_text(path: Path, info: dict[str, Any], texts: dict[int, list[dict[str, 
     lines += frame_lines(info)
     if training.get("profile"):
         lines.append("of training: " + ", ".join(f"{name} {share:.0%}" for name, share in shares(training).items()))
-    if info.get("depth"):
-        lines.append(
-            f"depth images: {info['depth']['views']}, measured in {info['depth']['measured']:.0%} of their pixels"
-        )
+    if depth := info.get("depth"):
+        lines.append(f"depth images: {depth['views']}, measured in {depth['measured']:.0%} of their pixels")
     lines += [f"printed on {i}: " + ", ".join(f'"{e["text"]}"' for e in read) for i, read in (texts or {}).items()]
     lines += [f"decision: {text}" for text in training.get("decisions", [])]
     return "\n".join([*lines, *left_out, *warnings])
 
 
 def _verdict(quality: dict[str, Any], left_out: int, warnings: int) -> str:
-    """How good the map is, in one line."""
+    """The quality of the map in one line."""
     if quality.get("psnr") is None:
         parts = ["not measured, as no photo was held out"]
     else:
         psnr = quality["psnr"]
-        word = "sharp" if psnr >= SHARP else "blurred in places" if psnr >= BLURRED else "poor"
-        count = len(quality["views"])
-        parts = [f"{word}: PSNR {psnr:.2f} dB, SSIM {quality['ssim']:.3f}, held-out photos: {count}"]
+        grade = "sharp" if psnr >= SHARP else "blurred in places" if psnr >= BLURRED else "poor"
+        parts = [f"{grade}: PSNR {psnr:.2f} dB, SSIM {quality['ssim']:.3f}, held-out photos: {len(quality['views'])}"]
     if quality.get("depth"):
         parts.append(depth_text(quality["depth"]))
     parts += [f"{what}: {count}" for what, count in (("photos left out", left_out), ("warnings", warnings)) if count]
@@ -151,12 +143,12 @@ def _hit_row(rank: int, hit: Hit, metric: bool | None, guessed: Mapping[int, str
     x, y, z = hit.centroid
     scale, unit, length = (100.0, " cm", " m") if in_metres else (1.0, "", "")
     sides = " x ".join(f"{scale * side:.{0 if in_metres else 3}f}" for side in hit.obb.extent)
-    where = f"instance {hit.instance_id}"
-    where += "" if hit.part is None else f", part {hit.part}"
-    where += f", together {', '.join(map(str, hit.instances))}" if hit.instances else ""
-    where += "" if hit.map is None else f" in {hit.map}"
+    ident = f"instance {hit.instance_id}"
+    ident += "" if hit.part is None else f", part {hit.part}"
+    ident += f", together {', '.join(map(str, hit.instances))}" if hit.instances else ""
+    ident += "" if hit.map is None else f" in {hit.map}"
     position = f"at {x:.2f} {y:.2f} {z:.2f}{length}" if in_metres else f"at {x:.3f} {y:.3f} {z:.3f}"
-    return [f"{rank}.", name, f"score {hit.score:.2f}", position, f"size {sides}{unit}", where]
+    return [f"{rank}.", name, f"score {hit.score:.2f}", position, f"size {sides}{unit}", ident]
 
 
 def write_hits(path: Path, hits: list[Hit]) -> None:

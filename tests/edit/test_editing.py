@@ -92,6 +92,15 @@ def test_merge_joins_points_names_and_words(path: Path) -> None:
     np.testing.assert_allclose(saved.language["embeddings"][place], expected, atol=1e-6)
 
 
+def test_a_merged_instance_can_be_merged_again(path: Path) -> None:
+    """It has the largest id and stands before the others."""
+    editor = Editor(path)
+    joined = editor.merge([editor.merge([0, 1]), 2])
+    assert [entry["id"] for entry in editor.instances] == [joined] and np.sum(editor.ids == joined) == 180
+    editor.save()
+    assert len(read_map(path).language["embeddings"]) == 1
+
+
 def test_split_finds_the_two_halves(path: Path) -> None:
     editor = Editor(path)
     parts = editor.split(2)

@@ -11,9 +11,7 @@ from skimage.metrics import peak_signal_noise_ratio
 
 from perception.errors import InputError
 from perception.evaluate.images import evaluate_images, psnr, run_images, ssim
-from perception.evaluate.instances import evaluate
-from perception.evaluate.layouts import run_instances
-from perception.evaluate.overlap import overlap_of_ids, read_truth
+from perception.evaluate.instances import evaluate, overlap_of_ids, read_truth, run_instances
 from perception.io.cloud import write_cloud
 from perception.types import PointCloud
 

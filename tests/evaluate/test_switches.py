@@ -10,7 +10,7 @@ import pytest
 
 from perception.cli import main
 from perception.errors import InputError
-from perception.export.transfer import ExportOptions, export_labels
+from perception.export.export_map import ExportOptions, export_labels
 from perception.io.cloud import write_cloud
 from perception.types import PointCloud
 

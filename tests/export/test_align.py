@@ -65,18 +65,18 @@ def test_steps_on_planes_and_brightness_end_at_the_true_place() -> None:
     gray = np.repeat((box_rooms.texture(points)[:, None] * 255).astype(np.uint8), 3, axis=1)
     views = box_rooms.views(FURNISHED, textured=True)
     registration = module.Registration(views, PointCloud(points, gray), similar=True)
-    true = module.Place(np.eye(3), registration.scan_middle - registration.middle)
+    true = module.Similarity(np.eye(3), registration.scan_middle - registration.middle)
     turn = Rotation.from_euler("xyz", [2, -1, 2], degrees=True).as_matrix()
-    place = module.Place(1.04 * turn, true.shift + np.array([0.06, -0.06, 0.05]))
+    place = module.Similarity(1.04 * turn, true.shift + np.array([0.06, -0.06, 0.05]))
     w = registration.tolerance
     planes, rms, information = registration._icp(place, registration.rows, [3 * w] * 8 + [w] * 8)
     assert registration.apart(planes, true) < 0.01 and planes.scale == pytest.approx(1, abs=0.003) and rms < 0.02
     assert np.linalg.eigvalsh(information)[0] > module.LEAST_STIFFNESS
-    pictures = registration._photometric(module.Place(1.01 * np.eye(3), true.shift + 0.02), registration.rows)
+    pictures = registration._photometric(module.Similarity(1.01 * np.eye(3), true.shift + 0.02), registration.rows)
     assert registration.apart(pictures, true) < 0.01
     assert registration.judged(pictures)[0] > registration.judged(place)[0]
     every, registration.rows = registration.rows, registration.rows[:20]  # too few to compare two places
-    pictures = registration._photometric(module.Place(1.01 * np.eye(3), true.shift + 0.02), every)
+    pictures = registration._photometric(module.Similarity(1.01 * np.eye(3), true.shift + 0.02), every)
     assert registration.apart(pictures, true) < 0.01
 
 

@@ -10,8 +10,7 @@ import pytest
 
 from perception.colors import instance_palette
 from perception.errors import InputError
-from perception.export.export_map import export_map
-from perception.export.transfer import ExportOptions
+from perception.export.export_map import ExportOptions, export_map
 from perception.io.cloud import read_cloud
 from perception.map.write import write_map
 from support.viewer_maps import small_map

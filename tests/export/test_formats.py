@@ -10,7 +10,7 @@ import pytest
 from bench.scannet import write_scannet
 from perception.boxes import oriented_box
 from perception.errors import InputError
-from perception.export.transfer import ExportOptions, check_overlap, export_labels, write_export
+from perception.export.export_map import ExportOptions, check_overlap, export_labels, write_export
 from perception.io.cloud import read_cloud
 from perception.types import PointCloud
 

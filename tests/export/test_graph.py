@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial import Delaunay
 
 from perception.errors import InputError
+from perception.export import neighbors
 from perception.export.neighbors import Neighbors, list_normals, nearest_gaussian, neighbor_lists
 from perception.export.smooth import (
     felzenszwalb,
@@ -75,7 +76,8 @@ def test_threads_and_order_do_not_change_answers():
     np.testing.assert_array_equal(Neighbors(points, threads=3).query(queries[shuffle], 3)[0], one[shuffle])
 
 
-def test_nearest_gaussian_streams_and_skips_what_is_not_finite():
+def test_nearest_gaussian_streams_and_skips_what_is_not_finite(monkeypatch):
+    monkeypatch.setattr(neighbors, "CHUNK", 64)
     rng = np.random.default_rng(2)
     points, means = rng.random((1000, 3)), rng.random((90, 3))
     means[5] = np.nan
@@ -84,7 +86,7 @@ def test_nearest_gaussian_streams_and_skips_what_is_not_finite():
     distance[:, 5] = np.inf
     want = distance.argmin(axis=1)
     want[3] = -1
-    np.testing.assert_array_equal(nearest_gaussian(points, means, chunk=64), want)
+    np.testing.assert_array_equal(nearest_gaussian(points, means), want)
     near = nearest_gaussian(points, means, max_distance=0.1)
     np.testing.assert_array_equal(near, np.where(distance.min(axis=1) <= 0.1, want, -1))
     assert (nearest_gaussian(points, np.empty((0, 3))) == -1).all()

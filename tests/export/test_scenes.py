@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from perception.evaluate.instances import evaluate
+from perception.export.export_map import ExportOptions, export_labels
 from perception.export.smooth import segment_cloud, vote
-from perception.export.transfer import ExportOptions, export_labels
 from perception.io.cloud import read_cloud
 from perception.types import PointCloud
 

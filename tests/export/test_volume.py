@@ -9,8 +9,16 @@ import pytest
 
 from perception.errors import InputError
 from perception.export.depth_views import DepthView
-from perception.export.mesh import check_outputs
-from perception.export.volume import FREE, OCCUPIED, centres, closed_body, grid_shape, occupancy, signed_distance
+from perception.export.mesh import (
+    FREE,
+    OCCUPIED,
+    centres,
+    check_outputs,
+    closed_body,
+    grid_shape,
+    occupancy,
+    signed_distance,
+)
 from perception.io.open3d import fuse_depth, write_glb
 from support import box_rooms
 from support.aimed import look_at

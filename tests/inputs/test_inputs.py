@@ -270,7 +270,7 @@ def test_atomic_writes_leave_old_or_new(tmp_path):
 def test_a_swapped_folder_is_old_or_new_and_never_gone(tmp_path, monkeypatch, exchange):
     target, done, seen = tmp_path / "map", threading.Event(), set()
     if not exchange:
-        monkeypatch.setattr(atomic, "_exchange", lambda a, b: False)
+        monkeypatch.setattr(atomic, "exchange", lambda a, b: False)
 
     def write(text):
         with atomic_directory(target) as new:

@@ -67,7 +67,7 @@ def test_a_new_map_takes_over_what_lies_beside_the_old_one(
         raise OSError(errno.EPERM, "no hard links")
 
     if not exchange:
-        monkeypatch.setattr(atomic, "_exchange", lambda a, b: False)
+        monkeypatch.setattr(atomic, "exchange", lambda a, b: False)
     if not links:
         monkeypatch.setattr(os, "link", none)
     keep_things(gmap)
@@ -104,7 +104,7 @@ def test_a_writer_is_killed_at_every_change(
         return tmp_path / name
 
     if not exchange:
-        monkeypatch.setattr(atomic, "_exchange", lambda a, b: False)
+        monkeypatch.setattr(atomic, "exchange", lambda a, b: False)
     if not links:
         monkeypatch.setattr(os, "link", none)
     keep_things(gmap)

@@ -19,7 +19,7 @@ from perception.config import load_config
 from perception.edit.editor import Editor
 from perception.errors import InputError
 from perception.gaussians.train import Trainer
-from perception.io.atomic import lock_file, writing
+from perception.map.replace import lock_file, writing
 from perception.map.write import read_map, set_labels, verify_map, write_map
 from perception.pipeline import mapping
 from perception.pipeline.checkpoint import CHECKPOINT, load_checkpoint, save_checkpoint, work_folder
@@ -88,7 +88,7 @@ from perception.io import atomic
 from perception.map.write import read_map, write_map
 
 path = Path(sys.argv[1])
-atomic._exchange = lambda a, b: False
+atomic.exchange = lambda a, b: False
 gmap = read_map(path)
 gmap.instances[0]["label"] = "new"
 renamed = []
@@ -212,7 +212,7 @@ def test_a_second_mapper_is_refused_and_harms_nothing(small_scene: Path, tmp_pat
     work_folder(out).mkdir()
     (work_folder(out) / "kept").touch()
     code = (
-        "import sys; from pathlib import Path; from perception.io.atomic import writing\n"
+        "import sys; from pathlib import Path; from perception.map.replace import writing\n"
         "with writing(Path(sys.argv[1])):\n    print(flush=True); sys.stdin.read()"
     )
     holder = subprocess.Popen(

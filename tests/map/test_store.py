@@ -22,8 +22,8 @@ from hypothesis import strategies as st
 import perception
 from perception.cli import main
 from perception.errors import InputError
-from perception.io.atomic import lock_file, writing
 from perception.io.ply import read_ply
+from perception.map.replace import lock_file, writing
 from perception.map.write import read_map, set_labels, verify_map, write_map
 from support.query_maps import encoders, write_map_of
 
@@ -302,7 +302,7 @@ def test_two_writers_of_one_map_the_second_is_refused(copied: Path) -> None:
 
 def test_another_process_is_refused_and_a_killed_one_is_not_in_the_way(copied: Path) -> None:
     code = (
-        "import sys, time; from pathlib import Path; from perception.io.atomic import writing\n"
+        "import sys, time; from pathlib import Path; from perception.map.replace import writing\n"
         "with writing(Path(sys.argv[1])):\n    print('held', flush=True); time.sleep(60)"
     )
     holder = subprocess.Popen(

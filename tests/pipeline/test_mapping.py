@@ -18,8 +18,8 @@ import perception
 from perception.cli import main
 from perception.config import load_config
 from perception.errors import InputError
-from perception.io.atomic import lock_file
 from perception.io.cloud import read_cloud
+from perception.map.replace import lock_file
 from perception.map.write import read_map
 from perception.pipeline import checkpoint
 from perception.pipeline.checkpoint import work_folder
@@ -89,7 +89,7 @@ def test_instances_agree_with_the_truth(finished: Path, small_scene: Path, tmp_p
     truth = small_scene / "truth" / "gt_points.ply"
     assert main(["export", str(finished), "--points", str(truth), "-o", str(out), "--json"]) == 0
     assert main(["eval", "instances", str(out), str(truth), "--json"]) == 0
-    from perception.evaluate.layouts import run_instances
+    from perception.evaluate.instances import run_instances
 
     result, _ = run_instances(out, truth)
     assert result["ap25"] > 0.4

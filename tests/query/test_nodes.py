@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from perception.errors import InputError
-from perception.export.export_map import at_granularity, export_map
-from perception.export.transfer import ExportOptions
+from perception.export.export_map import ExportOptions, at_granularity, export_map
 from perception.io.cloud import read_cloud
 from perception.language.colors import PALETTE
 from perception.language.description import InstanceDescription, to_arrays

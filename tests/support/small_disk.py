@@ -18,8 +18,7 @@ import torch
 
 from perception.edit.editor import Editor
 from perception.errors import InputError
-from perception.export.export_map import export_map
-from perception.export.transfer import ExportOptions
+from perception.export.export_map import ExportOptions, export_map
 from perception.map.write import read_map, set_labels, verify_map, write_map
 from perception.masks.label_files import write_labels
 from perception.photos.scene_file import save_scene

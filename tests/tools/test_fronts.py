@@ -15,7 +15,7 @@ from perception.bench.output import table
 from perception.cli import main
 from perception.config import load_config
 from perception.errors import InputError
-from perception.evaluate.layouts import run_instances
+from perception.evaluate.instances import run_instances
 from speed import fronts
 from speed.fronts import Variant, pareto, run_sweep, settings_of, sweep_parser, variants
 

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perception.io.atomic import writing
 from perception.language.description import InstanceDescription, to_arrays
+from perception.map.replace import writing
 from perception.map.write import read_map, set_labels, write_map
 from perception.query import QueryMap
 from support.viewer_maps import free_port, small_map

@@ -31,7 +31,7 @@ def case(views, cloud, seed, metric, plain):
     turn, shift = Rotation.random(random_state=rng).as_matrix(), rng.uniform(-20, 20, 3)
     scan = PointCloud(scale * points @ turn + shift, None if plain else cloud.colors[kept])
     job = module.Registration(views, scan, not metric)
-    right = module.Place(turn / scale, turn @ (job.scan_middle - shift) / scale - job.middle)
+    right = module.Similarity(turn / scale, turn @ (job.scan_middle - shift) / scale - job.middle)
     candidates = job.candidates()
     refined = job.refined(candidates)
     stages = {"candidates": candidates, "best": job._distinct(candidates, 0.04, module.REFINED), "ICP": refined[:3]}

@@ -113,7 +113,7 @@ class DatasetBench(ABC):
             listed = self.work / "held_out" / f"{scene}.txt"
             text = "".join(f"{name}\n" for name in held_out)
             if not listed.is_file() or listed.read_text(encoding="utf-8") != text:  # a new file would be another input
-                with atomic_file(listed) as aside:
+                with atomic_file(listed, parents=True) as aside:
                     aside.write_text(text, encoding="utf-8")
             more.append(f"photos.held_out={listed}")
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -12,15 +12,25 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.evaluate.instances import Protocol, evaluate_overlaps, evaluated_truth, get_protocol
-from perception.evaluate.layouts import instances_table
-from perception.evaluate.overlap import OBJECT, Overlap, Truth
-from perception.export.transfer import Instances
-from perception.io.atomic import replacing
+from perception.evaluate.instances import (
+    OBJECT,
+    Overlap,
+    Protocol,
+    Truth,
+    evaluate_overlaps,
+    evaluated_truth,
+    get_protocol,
+    instances_table,
+)
+from perception.io.atomic import atomic_file
 
 
 def write_scannet(
-    folder: str | Path, scene: str, labels: np.ndarray, instances: Instances, classes: Mapping[int, int] | None = None
+    folder: str | Path,
+    scene: str,
+    labels: np.ndarray,
+    instances: Mapping[int, Mapping[str, Any]],
+    classes: Mapping[int, int] | None = None,
 ) -> Path:
     """ScanNet's 3D instance submission: <scene>.txt with "predicted_masks/<scene>_<nnn>.txt <class> <confidence>" rows.
 
@@ -39,10 +49,10 @@ def write_scannet(
     for number, i in enumerate(sorted(ids, key=lambda i: (-score[i], i))):
         name = f"{scene}_{number:03d}.txt"
         digits = np.where(labels == i, ord("1"), ord("0")).astype(np.uint8)
-        with replacing(masks / name) as file:
+        with atomic_file(masks / name) as new, new.open("wb") as file:
             file.write(np.stack([digits, np.full_like(digits, ord("\n"))], axis=1).tobytes())
         rows.append(f"predicted_masks/{name} {1 if classes is None else classes.get(i, 0)} {score[i]:.6f}\n")
-    with replacing(folder / f"{scene}.txt") as file:
+    with atomic_file(folder / f"{scene}.txt") as new, new.open("wb") as file:
         file.write("".join(rows).encode())
     return folder / f"{scene}.txt"
 

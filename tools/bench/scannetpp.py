@@ -17,8 +17,8 @@ import numpy as np
 from bench.datasets import DatasetBench, link
 from bench.scannet import run_scannet, write_scannet
 from perception.errors import InputError
-from perception.evaluate.layouts import instances_table
-from perception.export.transfer import ExportOptions, export_labels
+from perception.evaluate.instances import instances_table
+from perception.export.export_map import ExportOptions, export_labels
 from perception.io.atomic import atomic_file
 from perception.io.cloud import read_cloud, write_cloud
 from perception.photos.decode import photo_size
@@ -136,7 +136,7 @@ class ScanNetPP(DatasetBench):
         submission.mkdir(parents=True, exist_ok=True)
         parts = [self.work / "predictions" / name for name in scenes]
         for part, (name, scene) in zip(parts, scenes.items(), strict=True):
-            with atomic_file(truth / f"{name}.txt") as aside:
+            with atomic_file(truth / f"{name}.txt", parents=True) as aside:
                 np.savetxt(aside, vertex_truth(scene, classes), fmt="%d")
             for file in (*part.glob(f"{name}.txt"), *part.glob("predicted_masks/*.txt")):
                 link(file, submission / file.relative_to(part))

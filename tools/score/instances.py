@@ -34,7 +34,7 @@ def read_scene(scene: Path) -> dict[str, Any]:
 def read_truth_cloud(scene: Path, gmap: Map) -> PointCloud:
     """gt_points.ply in the map's frame, which for a map from photos alone is found from the true camera centres. Raises
     InputError without the label `instance_id`, or with most points off the map."""
-    from perception.export.transfer import check_overlap
+    from perception.export.export_map import check_overlap
     from perception.io.cloud import read_cloud
 
     cloud = read_cloud(scene / "gt_points.ply")
@@ -59,10 +59,9 @@ def score_map(scene: Path, map_path: Path) -> dict[str, Any]:
     Under the key SCORED, a pair for each instance with at least MIN_POINTS points: its score, and 1 if its IoU with a
     true instance exceeds 0.5, else 0.
     """
-    from perception.evaluate.instances import evaluate
-    from perception.evaluate.overlap import overlap_of_ids, read_truth
+    from perception.evaluate.instances import evaluate, overlap_of_ids, read_truth
+    from perception.export.export_map import export_labels
     from perception.export.render import as_gaussians
-    from perception.export.transfer import export_labels
     from perception.map.write import read_map
 
     gmap = read_map(map_path)

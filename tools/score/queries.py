@@ -95,7 +95,7 @@ def read_words(scene: Path) -> set[str]:
 
 def true_objects(opened: QueryMap, scene: Path) -> list[int]:
     """The true id that most exported points of each instance carry; −1 where no point has one."""
-    from perception.export.transfer import export_labels
+    from perception.export.export_map import export_labels
 
     cloud = read_truth_cloud(scene, opened)
     labels = export_labels(opened.means, opened.instance_ids, cloud)

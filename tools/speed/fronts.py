@@ -96,7 +96,7 @@ def run_sweep(options: argparse.Namespace, cells: Sequence[Variant]) -> list[dic
         kept = options.output / "maps" / f"{hashlib.sha256(parts.encode()).hexdigest()[:16]}.json"
         known = kept.is_file()
         if not known:
-            with atomic_file(kept) as aside:
+            with atomic_file(kept, parents=True) as aside:
                 aside.write_text(json.dumps(map_variant(options.scene, variant, pairs, kept)), encoding="utf-8")
         rows.append({**asdict(variant), **json.loads(kept.read_text(encoding="utf-8"))})
         line = f"{number}/{len(chosen)} {variant.group} {variant.name}: {60 * rows[-1]['minutes']:.0f} s"

@@ -114,6 +114,6 @@ def cached_kernels(options: KernelOptions, architecture: int) -> bytes:
     if file.is_file():
         return file.read_bytes()
     cubin, _ = compile_kernels(nvrtc, options, architecture)
-    with contextlib.suppress(OSError, InputError), atomic_file(file) as part:
+    with contextlib.suppress(InputError), atomic_file(file, parents=True) as part:
         part.write_bytes(cubin)  # or, in a home that cannot be written to, compiled again next time
     return cubin

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from perception.cli import main
-from perception.io.outputs import refuse_inputs
 from perception.io.ply import write_ply
+from perception.map.outputs import refuse_inputs
 from perception.map.write import write_map
 from perception.types import View
 from support.viewer_maps import small_map

@@ -62,14 +62,12 @@ def check_side_file(side: Path, output: Path, key: str = "") -> None:
         raise InputError(f"{side}: {found}; choose another name for the output")
 
 
-def _identities(file: Path) -> list[Any]:
+def _identities(file: Path) -> Iterator[Any]:
     """The path without links and, where there is a file, its device and inode."""
-    found: list[Any] = []
     with contextlib.suppress(OSError, ValueError):  # nothing is there, or a NUL is in the name
-        found.append(os.path.realpath(file))
+        yield os.path.realpath(file)
         stat = file.stat()
-        found.append((stat.st_dev, stat.st_ino))
-    return found
+        yield stat.st_dev, stat.st_ino
 
 
 def _files(source: Path) -> Iterator[Path]:
@@ -80,15 +78,9 @@ def _files(source: Path) -> Iterator[Path]:
         yield from (file for file in source.rglob("*") if file.is_file())
     else:
         yield from (source / name for name in MAP_FILES)
-        yield from _photos(source)
-
-
-def _photos(folder: Path) -> Iterator[Path]:
-    try:
-        views = json.loads((folder / FACTS).read_bytes())["views"]
-        for view in views:
-            yield Path(view["photo"])
-            if view.get("photo_beside") is not None:
-                yield absolute(pointed(folder) / view["photo_beside"])
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return  # the command itself tells what is wrong with its map
+        # The command itself reports what is wrong with its map.
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            for view in json.loads((source / FACTS).read_bytes())["views"]:
+                yield Path(view["photo"])
+                if view.get("photo_beside") is not None:
+                    yield absolute(pointed(source) / view["photo_beside"])
