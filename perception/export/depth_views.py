@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from perception.gaussians.model import Gaussians
-from perception.gaussians.render import render
+from perception.gaussians.views import render
 from perception.geometry import sums_by
 from perception.photos.decode import scaled_K, scaled_size
 from perception.photos.depth import without_edges

@@ -14,8 +14,7 @@ import torch
 from perception.errors import InputError
 from perception.frame.recentre import map_from_input, moved
 from perception.gaussians.model import Gaussians
-from perception.gaussians.render import render
-from perception.gaussians.views import depth_image
+from perception.gaussians.views import depth_image, render
 from perception.instances.silhouettes import render_silhouettes
 from perception.io.atomic import atomic_file
 from perception.io.documents import safe_name

@@ -19,12 +19,15 @@ START, STOP = 0.05, 0.6
 PERCENT_DENSE = 0.01
 """A Gaussian is split if its largest scale exceeds this share of the scene extent, else cloned (Kerbl et al. 2023)."""
 PRUNE_OPACITY = 0.005
+"""Opacity below which a Gaussian is removed (Kerbl et al. 2023)."""
+OPACITY_MARGIN = 1e-6
+"""Opacities are kept this far from 0 and 1, where logits are infinite."""
 OPACITY_DECAY = 1e-2
 """Share by which every opacity is reduced before each densification."""
 SPLIT_SHRINK = 1.6
 """Scales of the two halves of a split Gaussian are divided by this (Kerbl et al. 2023)."""
 BEYOND = 0.3
-"""Factor on the gradient of a Gaussian beyond the box for which a block of a large place is trained: it will be dropped
+"""Factor on the gradient of a Gaussian beyond the box for which a block of a large scene is trained: it will be dropped
 later, and is needed only for what photos show behind or beside the box."""
 
 
@@ -46,17 +49,6 @@ class Statistics:
         add_statistics = training_kernels(visible.device).add_statistics
         add_statistics(gradient_px, visible, self.gradient, self.seen, 0.5 * long_side)
 
-    def mean_gradient(self) -> torch.Tensor:
-        return self.gradient / self.seen.clamp(min=1)
-
-
-@dataclass(frozen=True)
-class Change:
-    """keep: indices [K] of rows that stay, in order; born: new Gaussians appended after them."""
-
-    keep: torch.Tensor
-    born: Gaussians
-
 
 def target_count(progress: float, initial: int, budget: int) -> int:
     """Gaussians allowed at `progress` in [0, 1]: a straight ramp from the initial count to the budget."""
@@ -72,16 +64,17 @@ def densify(
     grad_threshold: float,
     seed: int,
     box: torch.Tensor | None = None,
-) -> Change:
+) -> tuple[torch.Tensor, Gaussians]:
     """Prunes, then clones or splits the best candidates while there are at most `allowed` Gaussians.
 
     extent: scene size in world units. grad_threshold: mean gradient (see Statistics) above which a Gaussian is
     cloned or split. box: [2, 3] corners of the part of space that matters, see BEYOND; None: all of it. Opacities of
-    cloned Gaussians change in place. Global random state is not used.
+    cloned Gaussians change in place. Returns the indices [K] int64 of the rows to keep, in order, and the Gaussians to
+    append.
     """
     needed = _needed(gaussians, statistics)
     room = max(0, allowed - int(needed.sum()))
-    score = statistics.mean_gradient()
+    score = statistics.gradient / statistics.seen.clamp(min=1)
     if box is not None:
         inside = ((gaussians.means >= box[0]) & (gaussians.means < box[1])).all(dim=1)
         score = torch.where(inside, score, BEYOND * score)
@@ -94,18 +87,21 @@ def densify(
     split, clone = candidates[large], candidates[~large]
 
     # Rota Bulò et al. 2024, eq. 11: clone and original get o' = 1 − sqrt(1 − o); both together have opacity o.
-    halved = _halved_logit(gaussians.opacity_logits[clone])
-    gaussians.opacity_logits[clone] = halved
+    opacities = sigmoid(gaussians.opacity_logits[clone]).clamp(max=1 - OPACITY_MARGIN)
+    gaussians.opacity_logits[clone] = _logit(1 - torch.sqrt(1 - opacities))
     needed[split] = False
     generator = torch.Generator().manual_seed(seed)
     born = Gaussians.concatenate([gaussians.rows(clone), *_halves(gaussians, split, generator)])
-    return Change(torch.nonzero(needed).flatten(), born)
+    return torch.nonzero(needed).flatten(), born
 
 
 def decay_opacities(gaussians: Gaussians) -> None:
     """Multiplies every opacity by 1 − OPACITY_DECAY in place. Gaussians that no photo supports fade and are pruned."""
-    opacities = gaussians.opacities * (1 - OPACITY_DECAY)
-    gaussians.opacity_logits.copy_(torch.logit(opacities.clamp(1e-6, 1 - 1e-6)))
+    gaussians.opacity_logits.copy_(_logit(gaussians.opacities * (1 - OPACITY_DECAY)))
+
+
+def _logit(opacities: torch.Tensor) -> torch.Tensor:
+    return torch.logit(opacities.clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN))
 
 
 def _needed(gaussians: Gaussians, statistics: Statistics) -> torch.Tensor:
@@ -114,11 +110,6 @@ def _needed(gaussians: Gaussians, statistics: Statistics) -> torch.Tensor:
         unseen = torch.zeros_like(unseen)
     finite = torch.isfinite(gaussians.means).all(dim=1) & torch.isfinite(gaussians.log_scales).all(dim=1)
     return (gaussians.opacities >= PRUNE_OPACITY) & ~unseen & finite
-
-
-def _halved_logit(logits: torch.Tensor) -> torch.Tensor:
-    opacities = 1 - torch.sqrt(1 - sigmoid(logits).clamp(max=1 - 1e-6))
-    return torch.logit(opacities.clamp(1e-6, 1 - 1e-6))
 
 
 def _halves(gaussians: Gaussians, index: torch.Tensor, generator: torch.Generator) -> list[Gaussians]:

@@ -6,24 +6,24 @@ photo's mean colour there, at a depth taken from the nearest covered blocks. Tra
 
 from __future__ import annotations
 
-import math
+from dataclasses import replace
 
 import numpy as np
 import torch
 
-from perception.colors import sh_from_rgb
-from perception.gaussians.model import Gaussians
-from perception.gaussians.render import render
-from perception.gaussians.views import TrainingView, unprojected
+from perception.gaussians.model import Gaussians, isotropic
+from perception.gaussians.views import TrainingView, render, unprojected
 
 BLOCK = 8
 """Side of a block in pixels."""
 EMPTY = 0.5
 """A block is empty when its mean opacity is below this."""
 NEIGHBOURS = 12
+"""Nearest covered blocks from which the depth of an empty one is taken."""
 FAR = 0.75
 """Quantile of the depths of the nearest covered blocks that is used: regions without points are mostly background."""
 OPACITY = 0.5
+"""Opacity of the Gaussians added."""
 
 
 @torch.no_grad()
@@ -43,8 +43,8 @@ def fill_holes(gaussians: Gaussians, views: list[TrainingView], room: int, seed:
         empty, blocks = empty + int(holes.sum()), blocks + alphas.size
         if not holes.any() or not covered.any() or len(born) >= room:
             continue
-        found = _placed(view, holes, covered, depths, gaussians, generator).to(gaussians.means.device)
-        born = Gaussians.concatenate([born, found.rows(torch.arange(min(len(found), room - len(born))))])
+        new = _in_holes(view, holes, covered, depths, gaussians, generator).to(gaussians.means.device)
+        born = Gaussians.concatenate([born, new.rows(torch.arange(min(len(new), room - len(born))))])
     return born, empty / max(1, blocks)
 
 
@@ -52,8 +52,8 @@ def _blocks(gaussians: Gaussians, view: TrainingView) -> tuple[np.ndarray, np.nd
     """Mean opacity of each block [h, w], and its opacity-weighted mean depth [h, w], 0 where the opacity is 0."""
     height, width = view.photo.shape[:2]
     out = render(gaussians, view.camera_from_world, view.K, width, height, eps2d=view.eps2d)
-    images = torch.stack([out.alphas[0], out.depths[0]])
-    alpha, depth = _block_mean(images).cpu().numpy()
+    assert out.depths is not None  # for the type checker
+    alpha, depth = _block_mean(torch.stack([out.alphas[0], out.depths[0]])).cpu().numpy()
     return alpha, np.where(alpha > 0, depth / np.maximum(alpha, 1e-6), 0)
 
 
@@ -61,7 +61,7 @@ def _block_mean(images: torch.Tensor) -> torch.Tensor:
     return torch.nn.functional.avg_pool2d(images[None], BLOCK, ceil_mode=True)[0]
 
 
-def _placed(
+def _in_holes(
     view: TrainingView,
     holes: np.ndarray,
     covered: np.ndarray,
@@ -85,16 +85,9 @@ def _placed(
     K = view.K.numpy()
     means = unprojected(K, view.camera_from_world.double().numpy(), columns, rows, depth)
     colors = _block_mean(view.photo.float().permute(2, 0, 1))
-    sh = torch.zeros(len(empty), *like.sh.shape[1:])
-    sh[:, 0] = sh_from_rgb(colors[:, torch.from_numpy(holes)].T / 255)
-    quats = torch.zeros(len(empty), 4)
-    quats[:, 0] = 1.0
-    scale = torch.from_numpy(depth) * (0.5 * BLOCK / float(K[0, 0]))
-    return Gaussians(
-        means=torch.from_numpy(means.astype(np.float32)),
-        quats=quats,
-        log_scales=scale.clamp(min=1e-9).log()[:, None].repeat(1, 3),
-        opacity_logits=torch.full((len(empty),), math.log(OPACITY / (1 - OPACITY))),
-        sh=sh,
-        features=torch.rand(len(empty), like.features.shape[1], generator=generator) - 0.5,
-    )
+    rgb = colors[:, torch.from_numpy(holes)].T / 255
+    scales = torch.from_numpy(depth) * (0.5 * BLOCK / float(K[0, 0]))
+    log_scales = scales.clamp(min=1e-9).log()
+    balls = isotropic(means, log_scales, rgb, OPACITY, like.features.shape[1], generator)
+    harmonics = balls.sh.new_zeros(len(empty), like.sh.shape[1] - 1, 3)
+    return replace(balls, sh=torch.cat([balls.sh, harmonics], dim=1))
