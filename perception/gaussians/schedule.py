@@ -18,9 +18,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from perception.gaussians.densify import START, STOP, decay_opacities, densify, target_count
+from perception.gaussians.densify import START, STOP, decay_opacities, densify, fill_holes, target_count
 from perception.gaussians.early_stopping import TRIAL
-from perception.gaussians.holes import fill_holes
 from perception.gaussians.losses import photometric
 from perception.gaussians.optimiser import Rate
 from perception.gaussians.state import ITERATIONS, TrainingState

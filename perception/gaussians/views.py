@@ -152,7 +152,11 @@ def depth_image(
     gaussians: Gaussians, camera_from_world: torch.Tensor, K: torch.Tensor, width: int, height: int
 ) -> torch.Tensor:
     """Expected depth [H, W] on the CPU along the optical axis where the map is more than half opaque, 0 elsewhere."""
-    out = render(gaussians, camera_from_world, K, width, height)
+    return expected_depth(render(gaussians, camera_from_world, K, width, height))
+
+
+def expected_depth(out: Forward) -> torch.Tensor:
+    """`depth_image` of what `render` returned."""
     assert out.depths is not None  # for the type checker
     alpha = out.alphas[0]
     return torch.where(alpha > 0.5, out.depths[0] / alpha.clamp(min=1e-6), torch.zeros_like(alpha)).cpu()

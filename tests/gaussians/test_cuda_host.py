@@ -93,12 +93,13 @@ def test_machine_code_is_compiled_once_for_each_source_option_and_architecture(t
     assert compiling.cached_kernels(OPTIONS, 89) == b"cubin 5"
 
 
-def test_a_real_cubin_goes_through_the_driver_path(nvrtc):
+def test_a_real_cubin_goes_through_the_driver_path(nvrtc, monkeypatch):
     cubin, _ = compile_kernels(nvrtc, OPTIONS, 89)
     kernels = launch.Kernels(build(KernelOptions(5, True, True, double=True), None), cubin, lambda: nullcontext(0))
     inputs = scene(n=50)
     arguments = passed(inputs), Settings(inputs["width"], inputs["height"])
-    found = on_device.rasterize_forward(*arguments, lambda *_: kernels)
+    monkeypatch.setattr(on_device, "device_kernels", lambda *_: kernels)
+    found = on_device.rasterize_forward(*arguments)
     torch.testing.assert_close(found.colors, cpu.rasterize_forward(*arguments).colors, rtol=1e-12, atol=1e-12)
 
 

@@ -133,8 +133,7 @@ def trainer(device: torch.device | None, *more: str) -> Trainer:
 @pytest.fixture
 def pretended(monkeypatch):
     """The pretended device, with the emulator as its rasterizer."""
-    forward = on_device.rasterize_forward
-    monkeypatch.setattr(on_device, "rasterize_forward", lambda *given: forward(*given, emulated()))
+    monkeypatch.setattr(on_device, "device_kernels", emulated())
     monkeypatch.setattr(public, "_DEVICES", ("cpu", pretend_device.NAME))
     with pretended_device() as device:
         yield device

@@ -98,13 +98,11 @@ def emulated(lanes: int = IN_ORDER, edit: tuple[str, str] | None = None) -> Kern
 @contextmanager
 def on_emulator(kernels_for: KernelsFor) -> Iterator[None]:
     """Within it `perception.rasterize` runs the CUDA kernels."""
-    forward, backward = cpu.rasterize_forward, cpu.rasterize_backward
-    cpu.rasterize_forward = lambda *given: on_device.rasterize_forward(*given, kernels_for)
-    cpu.rasterize_backward = on_device.rasterize_backward
-    try:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(on_device, "device_kernels", kernels_for)
+        patch.setattr(cpu, "rasterize_forward", on_device.rasterize_forward)
+        patch.setattr(cpu, "rasterize_backward", on_device.rasterize_backward)
         yield
-    finally:
-        cpu.rasterize_forward, cpu.rasterize_backward = forward, backward
 
 
 def emulate(inputs, lanes=IN_ORDER, edit=None, **options):

@@ -44,8 +44,8 @@ class KernelOptions:
 def sources() -> dict[str, str]:
     """Name -> text of kernels.cu and all it includes: from the installed package, or from the tree."""
     installed, tree = Path(__file__).parent / "csrc", Path(__file__).parents[3] / "csrc"
-    home = installed if installed.is_dir() else tree
-    files = [home / folder / name for folder, names in _FILES.items() for name in names]
+    root = installed if installed.is_dir() else tree
+    files = [root / folder / name for folder, names in _FILES.items() for name in names]
     return {"cmath": _CMATH} | {file.name: file.read_text(encoding="utf-8") for file in files}
 
 
@@ -115,5 +115,5 @@ def cached_kernels(options: KernelOptions, architecture: int) -> bytes:
         return file.read_bytes()
     cubin, _ = compile_kernels(nvrtc, options, architecture)
     with contextlib.suppress(OSError, InputError), atomic_file(file) as part:
-        part.write_bytes(cubin)  # or, in a home that cannot be written to, compiled again next time
+        part.write_bytes(cubin)  # where the folder cannot be written, it is compiled again next time
     return cubin

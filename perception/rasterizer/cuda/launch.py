@@ -12,7 +12,7 @@ import torch
 from perception.errors import InputError
 from perception.rasterizer.cuda.compile import OLDEST_ARCHITECTURE, KernelOptions, cached_kernels
 
-Place = Callable[[], AbstractContextManager[int]]
+Stream = Callable[[], AbstractContextManager[int]]
 THREADS = 256  # of a block, as in kernels.cu
 _TOO_NEW = (209, 218, 222)  # no kernel image, invalid PTX, unsupported PTX: the driver is older than the compiler
 
@@ -29,14 +29,14 @@ def load_driver() -> ctypes.CDLL:
 class Kernels:
     """Kernels of one module on one device.
 
-    image: a cubin. place: opens a context in which the device is current, and gives the handle of the stream to launch
+    image: a cubin. stream: opens a context in which the device is current, and gives the handle of the stream to launch
     on. RuntimeError names the driver's errors.
     """
 
-    def __init__(self, driver: ctypes.CDLL, image: bytes, place: Place):
-        self._driver, self._place, self._module = driver, place, ctypes.c_void_p()
+    def __init__(self, driver: ctypes.CDLL, image: bytes, stream: Stream):
+        self._driver, self._stream, self._module = driver, stream, ctypes.c_void_p()
         self._functions: dict[str, ctypes.c_void_p] = {}
-        with place():
+        with stream():
             self._check(driver.cuModuleLoadData(ctypes.byref(self._module), image), "loading the kernels")
 
     def _check(self, code: int, doing: str) -> None:
@@ -44,23 +44,23 @@ class Kernels:
             return
         text = ctypes.c_char_p()
         self._driver.cuGetErrorString(code, ctypes.byref(text))
-        found = text.value.decode(errors="replace") if text.value else "unknown"
+        message = text.value.decode(errors="replace") if text.value else "unknown"
         hint = "; the driver is too old for this torch's CUDA: update it" if code in _TOO_NEW else ""
-        raise RuntimeError(f"CUDA error {code} in {doing}: {found}{hint}")
+        raise RuntimeError(f"CUDA error {code} in {doing}: {message}{hint}")
 
     def launch(self, name: str, blocks: int, *arguments: ctypes._SimpleCData | ctypes.Structure) -> None:
-        """Launches `name` on so many blocks; the driver copies the arguments, not what they point to."""
+        """Launches `name` on `blocks` blocks; the driver copies the arguments, not what they point to."""
         if blocks == 0:
             return
         if name not in self._functions:
             function = ctypes.c_void_p()
-            found = self._driver.cuModuleGetFunction(ctypes.byref(function), self._module, name.encode())
-            self._check(found, f"looking up {name}")
+            code = self._driver.cuModuleGetFunction(ctypes.byref(function), self._module, name.encode())
+            self._check(code, f"looking up {name}")
             self._functions[name] = function
         table = (ctypes.c_void_p * len(arguments))(*[ctypes.addressof(argument) for argument in arguments])
-        with self._place() as stream:
-            where = (blocks, 1, 1, THREADS, 1, 1, 0, ctypes.c_void_p(stream))
-            self._check(self._driver.cuLaunchKernel(self._functions[name], *where, table, None), name)
+        with self._stream() as stream:
+            grid = (blocks, 1, 1, THREADS, 1, 1, 0, ctypes.c_void_p(stream))
+            self._check(self._driver.cuLaunchKernel(self._functions[name], *grid, table, None), name)
 
 
 def device_kernels(options: KernelOptions, device: torch.device) -> Kernels:
@@ -78,8 +78,8 @@ def _device_kernels(options: KernelOptions, index: int) -> Kernels:
         raise InputError(f"{name} has compute capability {major}.{minor}, expected 7.5 or more; compute on the CPU")
 
     @contextmanager
-    def place() -> Iterator[int]:
+    def stream() -> Iterator[int]:
         with torch.cuda.device(index):
             yield torch.cuda.current_stream().cuda_stream
 
-    return Kernels(load_driver(), cached_kernels(options, 10 * major + minor), place)
+    return Kernels(load_driver(), cached_kernels(options, 10 * major + minor), stream)
