@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from perception.errors import InputError
-from perception.rasterizer.cuda.compile import MAX_FEATURES, KernelOptions
-from perception.rasterizer.cuda.launch import THREADS, Kernels, device_kernels
+from perception.rasterizer.cuda.kernels import MAX_FEATURES, THREADS, KernelOptions, Kernels, device_kernels
 from perception.rasterizer.types import Cotangents, Forward, Gradients, Inputs, Settings
 
 _POINTER = ctypes.c_void_p

@@ -10,7 +10,7 @@ import torch
 import perception
 from perception.rasterizer import cpu
 from perception.rasterizer import device as on_device
-from perception.rasterizer.cuda.compile import KernelOptions
+from perception.rasterizer.cuda.kernels import KernelOptions
 from perception.rasterizer.types import Cotangents, Gradients, Settings
 from support.cuda_emulator import REVERSED, build, emulate, emulated, find_compiler, on_emulator, wide_scene, worst
 from support.hard_scenes import SCENES

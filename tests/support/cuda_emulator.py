@@ -19,8 +19,7 @@ import torch
 
 from perception.rasterizer import cpu
 from perception.rasterizer import device as on_device
-from perception.rasterizer.cuda.compile import KernelOptions
-from perception.rasterizer.cuda.launch import Kernels
+from perception.rasterizer.cuda.kernels import KernelOptions, Kernels
 from support.rasterizer import grads_and_images, scene
 
 CSRC = Path(__file__).resolve().parents[2] / "csrc"
