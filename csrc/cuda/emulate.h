@@ -4,7 +4,7 @@
 //   - every element of shared memory (SHARED): read before it was written in this block, or touched by two threads, one
 //     of them writing, with no barrier between. Only __syncthreads and __syncwarp order memory; ballots and shuffles do
 //     not. So a missing barrier is found in any order of the lanes.
-//   - every element of an array in global memory (GLOBAL): outside of the arrays that emulator_memory was told of.
+//   - every element of an array in global memory (GLOBAL): outside of the arrays registered by emulator_memory.
 //     Reads by the headers shared with the CPU are not checked.
 // Not modelled: races between blocks, caches, timing, the hardware's approximate functions.
 #pragma once
@@ -201,14 +201,14 @@ class Tracked {
   mutable Accesses accesses_;
 };
 
-inline std::map<uintptr_t, uintptr_t> memory;  // begin -> end of the arrays given; none: nothing is checked
+inline std::map<uintptr_t, uintptr_t> memory;  // begin -> end of the registered arrays; none: nothing is checked
 
 inline void check_inside(const void *at, std::size_t size) {
   if (memory.empty()) return;
   const uintptr_t begin = reinterpret_cast<uintptr_t>(at);
   const auto after = memory.upper_bound(begin);
   if (after == memory.begin() || begin + size > std::prev(after)->second)
-    fail("accesses memory outside of the arrays given");
+    fail("accesses memory outside of the registered arrays");
 }
 
 // Arrays that lay there before are gone.

@@ -1,4 +1,4 @@
-// Nearest neighbours in three dimensions: a balanced k-d tree with full buckets, built and asked by several threads.
+// Nearest neighbours in three dimensions: a balanced k-d tree with full buckets, built and searched by several threads.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -9,7 +9,7 @@
 namespace perception::graph {
 
 // Points and squared distances are float. Equal distances go to the smaller index, so answers depend neither on
-// threads nor on the order of queries. Only finite points may be given; a query that is not finite finds nothing.
+// threads nor on the order of queries. Points must be finite; a query that is not finite has no neighbours.
 class KdTree {
  public:
   static constexpr std::size_t kBucket = 16;  // one AVX-512 or two AVX2 registers of floats

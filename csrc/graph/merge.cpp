@@ -181,11 +181,11 @@ class Merger {
     }
     constexpr char kShares = 1, kNear = 2;
     std::vector<char> mark(in_.count, 0);
-    std::vector<std::int32_t> found;
+    std::vector<std::int32_t> others;
     for (std::size_t i = 0; i < in_.count; ++i) {
-      const auto add = [&](std::int32_t j, char how) {
-        if (!mark[j]) found.push_back(j);
-        mark[j] |= how;
+      const auto add = [&](std::int32_t j, char reason) {
+        if (!mark[j]) others.push_back(j);
+        mark[j] |= reason;
       };
       for (const MaskPart &part : segments_[i].masks) {
         const auto &list = holders[part.mask];
@@ -194,15 +194,15 @@ class Merger {
         }
       }
       for (const std::int32_t j : near[i]) add(j, kNear);
-      std::sort(found.begin(), found.end());
-      for (const std::int32_t j : found) {  // in order of i, so every row is ascending
+      std::sort(others.begin(), others.end());
+      for (const std::int32_t j : others) {  // in order of i, so every row is ascending
         const bool is_near = mark[j] & kNear;
         const double value = affinity(i, j, is_near);
         rows_[i].push_back({j, is_near, value});
         rows_[j].push_back({static_cast<std::int32_t>(i), is_near, value});
         mark[j] = 0;
       }
-      found.clear();
+      others.clear();
     }
   }
 

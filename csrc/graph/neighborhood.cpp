@@ -82,7 +82,7 @@ std::size_t undirected(const std::int32_t *neighbors, std::size_t count, std::si
       const std::int32_t b = neighbors[i * k + j];
       if (b < 0 || b == a) continue;
       const std::int32_t *list = neighbors + static_cast<std::size_t>(b) * k;
-      if (b < a && std::find(list, list + k, a) != list + k) continue;  // stands already, found from b
+      if (b < a && std::find(list, list + k, a) != list + k) continue;  // written already, from the list of b
       edges[2 * found] = std::min(a, b);
       edges[2 * found + 1] = std::max(a, b);
       ++found;

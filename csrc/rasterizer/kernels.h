@@ -15,7 +15,7 @@ struct Slice {
   bool alone = false;
 };
 
-// One camera of one call, as every kernel is given it.
+// One camera of one call: an argument of every kernel.
 template <class T>
 struct Pass {
   const Inputs<T> &in;

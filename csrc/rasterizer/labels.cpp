@@ -12,7 +12,7 @@ constexpr int kPixels = 16 * 16;  // of a tile, granule by granule
 // for `own`.
 struct Slots {
   int32_t *own;    // [L, n] label of every splat
-  int32_t *place;  // [L, n] slot of every splat in the tile's list, -1 without a label
+  int32_t *of_splat;  // [L, n] slot of every splat in the tile's list, -1 without a label
   int32_t *slot;   // [most] slot of every label, -1 for none yet
   int32_t *name;   // [slots] label of every slot
   int begin[kMaxLabellings + 1];  // first slot of every labelling
@@ -38,7 +38,7 @@ void number_labels(const Labels &labels, const Worker<T> &w, const TileList &lis
     for (int i = 0; i < list.n; ++i) {
       const int32_t label = slots.own[l * w.n + list.splats[i]];
       if (label >= 0 && slots.slot[label] < 0) slots.slot[label] = used, slots.name[used++] = label;
-      slots.place[l * w.n + list.splats[i]] = label < 0 ? -1 : slots.slot[label];
+      slots.of_splat[l * w.n + list.splats[i]] = label < 0 ? -1 : slots.slot[label];
     }
   }
   slots.begin[labels.count] = used;
@@ -52,9 +52,9 @@ void sum_weights(const Labels &labels, Worker<T> &w, const TileList &list, uint3
     for (int k = 0; k < count; ++k) {
       const auto weights = load_channels<16>(tile.weights[k], 16);
       for (int l = 0; l < labels.count; ++l) {
-        const int32_t place = slots.place[l * w.n + tile.lists[g][k]];
-        if (place < 0) continue;
-        T *sum = sums + place * kPixels + 16 * g;
+        const int32_t slot = slots.of_splat[l * w.n + tile.lists[g][k]];
+        if (slot < 0) continue;
+        T *sum = sums + slot * kPixels + 16 * g;
         store_channels(load_channels<16>(sum, 16) + weights, sum, 16);
       }
     }

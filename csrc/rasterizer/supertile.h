@@ -35,7 +35,7 @@ void load_supertile(const Inputs<T> &in, const Frame<T> &f, int tile, Slice slic
   std::memset(w.counts, 0, sizeof w.counts);
   alignas(64) uint32_t ids[16];
   uint16_t masks[16];
-  constexpr int kAhead = 16;  // places
+  constexpr int kAhead = 16;  // splats that are prefetched before they are used
   int kept = 0, pending = 0;
   for (int i = 0; i < n; ++i) {
     if (i + 2 * kAhead < n) __builtin_prefetch(&f.splats[list[i + 2 * kAhead]]);
@@ -81,7 +81,7 @@ inline void for_each_tile(const Inputs<T> &in, const Frame<T> &f, int index, Wor
 }
 
 // write(j, slot) for the splats of 64x64 tile `index` that were touched, and marks their slots: one a splat and tile it
-// touches, of `size` numbers. Slots lie far apart in memory: each is asked for some splats before it is written.
+// touches, of `size` numbers. Slots lie far apart in memory: each is prefetched some splats before it is written.
 template <class T, class Write>
 void for_each_slot(const Frame<T> &f, int index, const Worker<T> &w, Scratch<T> &scratch, int size, Write &&write) {
   constexpr int kAhead = 8;
@@ -96,8 +96,8 @@ void for_each_slot(const Frame<T> &f, int index, const Worker<T> &w, Scratch<T> 
     if (j + kAhead < w.n) __builtin_prefetch(&scratch.slots[w.source[j + kAhead]]);
     if (j >= w.n || !w.touched[j]) continue;
     const Splat<T> &s = w.splats[j];
-    const uint64_t place = static_cast<uint64_t>(ty - s.y0) * (s.x1 - s.x0 + 1) + (tx - s.x0);
-    slot = scratch.slots[w.source[j]] + place - box_tiles_before(s, f.tiles_x, scratch.first_tile);
+    const uint64_t offset = static_cast<uint64_t>(ty - s.y0) * (s.x1 - s.x0 + 1) + (tx - s.x0);
+    slot = scratch.slots[w.source[j]] + offset - box_tiles_before(s, f.tiles_x, scratch.first_tile);
     const T *record = scratch.records.data() + slot * size;
     __builtin_prefetch(record, 1), __builtin_prefetch(record + size - 1, 1),
         __builtin_prefetch(&scratch.touched[slot], 1);

@@ -7,8 +7,8 @@
 namespace perception::training {
 
 template <class T>
-int64_t adam(const AdamArguments<T> &a, const Execution &how) {
-  const auto &table = kernels<T>(how.level);
+int64_t adam(const AdamArguments<T> &a, const Execution &execution) {
+  const auto &table = kernels<T>(execution.level);
   const double correction1 = 1 - std::pow(a.beta1, double(a.step)), correction2 = 1 - std::pow(a.beta2, double(a.step));
   std::vector<T> rate(a.width);
   bool uniform = true;
@@ -30,7 +30,7 @@ int64_t adam(const AdamArguments<T> &a, const Execution &how) {
                          uniform};
   const Pieces pieces(a.rows, std::max<int64_t>(256, 32768 / std::max<int64_t>(1, a.width)), 64);
   std::vector<int64_t> skipped(pieces.count);
-  parallel_for(resolve_threads(how.threads), pieces.count,
+  parallel_for(resolve_threads(execution.threads), pieces.count,
                [&](std::size_t i, int) { skipped[i] = table.adam(rows, pieces.begin(i), pieces.end(i)); });
   int64_t total = 0;
   for (int64_t of_piece : skipped) total += of_piece;

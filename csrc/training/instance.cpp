@@ -60,19 +60,19 @@ Assignment assign(const int32_t *labels, int64_t pixels, int32_t *slots) {
 }
 
 template <class T>
-void prototypes(const LabelledFeatures<T> &given, const Prototypes &of, const Execution &how) {
-  const int64_t labels = of.labels, width = given.width;
+void prototypes(const LabelledFeatures<T> &input, const Prototypes &of, const Execution &execution) {
+  const int64_t labels = of.labels, width = input.width;
   if (labels == 0) return;
-  const auto &table = kernels<T>(how.level);
+  const auto &table = kernels<T>(execution.level);
   // Sums are taken about a pixel of the label itself, so that features far from zero do not cancel.
   std::vector<T> reference(labels * width);
   for (int64_t i = 0; i < labels; ++i) 
-    std::copy_n(given.features + of.first[i] * width, width, reference.begin() + i * width);
-  const Pieces pieces(given.pixels, 8192, labels * width > 100000 ? 4 : 16);
+    std::copy_n(input.features + of.first[i] * width, width, reference.begin() + i * width);
+  const Pieces pieces(input.pixels, 8192, labels * width > 100000 ? 4 : 16);
   const int64_t stride = labels * 2 * width;
   std::vector<double> sums(pieces.count * stride);
-  parallel_for(resolve_threads(how.threads), pieces.count, [&](std::size_t i, int) {
-    table.accumulate(given.features, given.slots, reference.data(), pieces.begin(i), pieces.end(i), width,
+  parallel_for(resolve_threads(execution.threads), pieces.count, [&](std::size_t i, int) {
+    table.accumulate(input.features, input.slots, reference.data(), pieces.begin(i), pieces.end(i), width,
                      &sums[i * stride]);
   });
   for (int64_t i = 1; i < pieces.count; ++i)
@@ -88,12 +88,12 @@ void prototypes(const LabelledFeatures<T> &given, const Prototypes &of, const Ex
 }
 
 template <class T>
-void spread(const LabelledFeatures<T> &given, const double *means, const double *pull, const double *push, T *out,
-            const Execution &how) {
-  const auto &table = kernels<T>(how.level);
-  const Pieces pieces(given.pixels);
-  parallel_for(resolve_threads(how.threads), pieces.count, [&](std::size_t i, int) {
-    table.spread(given.features, given.slots, means, pull, push, pieces.begin(i), pieces.end(i), given.width, out);
+void spread(const LabelledFeatures<T> &input, const double *means, const double *pull, const double *push, T *out,
+            const Execution &execution) {
+  const auto &table = kernels<T>(execution.level);
+  const Pieces pieces(input.pixels);
+  parallel_for(resolve_threads(execution.threads), pieces.count, [&](std::size_t i, int) {
+    table.spread(input.features, input.slots, means, pull, push, pieces.begin(i), pieces.end(i), input.width, out);
   });
 }
 

@@ -26,9 +26,9 @@ Photo<T> prepare(const PhotometricArguments<T> &a, double total_weight) {
 
 // Columns are cut so that a tile's rows fit the scratch, rows so that every thread has work; tiles are independent.
 template <class T>
-void run_tiles(const Photo<T> &photo, const Execution &how, int strips, double *l1, double *ssim) {
-  const auto &table = kernels<T>(how.level);
-  const int threads = resolve_threads(how.threads);
+void run_tiles(const Photo<T> &photo, const Execution &execution, int strips, double *l1, double *ssim) {
+  const auto &table = kernels<T>(execution.level);
+  const int threads = resolve_threads(execution.threads);
   const int bands = std::max(1, std::min({threads, photo.height / 16, 64}));
   const int64_t tiles = int64_t(strips) * bands;
   std::vector<std::unique_ptr<T[]>> scratch(std::min<int64_t>(tiles, threads));
@@ -52,18 +52,18 @@ double ordered_sum(const std::vector<double> &values) {
 }  // namespace
 
 template <class T>
-PhotometricResult photometric(const PhotometricArguments<T> &a, const Execution &how) {
+PhotometricResult photometric(const PhotometricArguments<T> &a, const Execution &execution) {
   if (a.height < 1 || a.width < 1 || a.channels < 1 || a.channels > kMaxChannels)
     throw std::invalid_argument("render: expected [H >= 1, W >= 1, 1 <= C <= 16]");
-  const auto &table = kernels<T>(how.level);
+  const auto &table = kernels<T>(execution.level);
   const double total_weight =
-      a.weight ? sum(a.weight, int64_t(a.height) * a.width, false, how) : double(a.height) * a.width;
+      a.weight ? sum(a.weight, int64_t(a.height) * a.width, false, execution) : double(a.height) * a.width;
   const Photo<T> photo = prepare(a, total_weight);
   const double per_element = total_weight > 0 ? 1 / (total_weight * a.channels) : 0;
   if (a.beta == 0) {
     std::vector<double> l1(a.height);
     const Pieces rows(a.height, 16, 64);
-    parallel_for(resolve_threads(how.threads), rows.count, [&](std::size_t i, int) {
+    parallel_for(resolve_threads(execution.threads), rows.count, [&](std::size_t i, int) {
       for (int64_t r = rows.begin(i); r < rows.end(i); ++r) l1[r] = table.absolute_row(photo, static_cast<int>(r));
     });
     const double mean = ordered_sum(l1) * per_element;
@@ -72,7 +72,7 @@ PhotometricResult photometric(const PhotometricArguments<T> &a, const Execution 
   const int widest = kTileElements / a.channels - 4 * kRadius;
   const int strips = (a.width + widest - 1) / widest;
   std::vector<double> l1(int64_t(strips) * a.height), ssim(l1.size());
-  run_tiles(photo, how, strips, l1.data(), ssim.data());
+  run_tiles(photo, execution, strips, l1.data(), ssim.data());
   const double mean_l1 = ordered_sum(l1) * per_element, mean_ssim = ordered_sum(ssim) * per_element;
   const double dissimilarity = total_weight > 0 ? 1 - mean_ssim : 0;
   return {(1 - a.beta) * mean_l1 + a.beta * dissimilarity, mean_l1, mean_ssim};

@@ -7,12 +7,12 @@
 namespace perception::training {
 
 template <class T>
-double sum(const T *values, int64_t n, bool squared, const Execution &how) {
-  const auto &table = kernels<T>(how.level);
+double sum(const T *values, int64_t n, bool squared, const Execution &execution) {
+  const auto &table = kernels<T>(execution.level);
   const auto run = squared ? table.sum_squares : table.sum;
   const Pieces pieces(n, 65536);
   std::vector<double> partial(pieces.count);
-  parallel_for(resolve_threads(how.threads), pieces.count, [&](std::size_t i, int) {
+  parallel_for(resolve_threads(execution.threads), pieces.count, [&](std::size_t i, int) {
     partial[i] = run(values + pieces.begin(i), pieces.end(i) - pieces.begin(i));
   });
   double total = 0;
@@ -21,10 +21,10 @@ double sum(const T *values, int64_t n, bool squared, const Execution &how) {
 }
 
 template <class T>
-void scale(const T *values, int64_t n, double factor, T *out, const Execution &how) {
+void scale(const T *values, int64_t n, double factor, T *out, const Execution &execution) {
   const Pieces pieces(n, 65536);
   const T f = T(factor);
-  parallel_for(resolve_threads(how.threads), pieces.count, [&](std::size_t piece, int) {
+  parallel_for(resolve_threads(execution.threads), pieces.count, [&](std::size_t piece, int) {
     const T *from = values + pieces.begin(piece);
     T *to = out + pieces.begin(piece);
     const int64_t m = pieces.end(piece) - pieces.begin(piece);

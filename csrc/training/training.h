@@ -16,7 +16,7 @@ struct Execution {
 template <class T>
 struct PhotometricArguments {
   const T *render;         // [height, width, channels]
-  const T *target;         // same shape; null when target8 is given
+  const T *target;         // same shape; null where target8 is not
   const uint8_t *target8;  // same shape, unit 1/255
   const T *weight;         // [height, width] >= 0 or null
   T *gradient;             // out [height, width, channels]: d loss / d render

@@ -11,7 +11,7 @@ import torch
 from scipy.ndimage import binary_erosion
 
 from perception.gaussians.model import Gaussians
-from perception.gaussians.render import render
+from perception.gaussians.views import expected_depth, render
 from perception.geometry import sums_by
 from perception.photos.decode import scaled_K, scaled_size
 from perception.photos.depth import without_edges
@@ -64,9 +64,8 @@ def depth_views(gaussians: Gaussians, views: Sequence[View], long_side: int = 64
         pose = np.asarray(view.camera_from_world, np.float64)
         camera, intrinsics = (torch.from_numpy(array.astype(np.float32)) for array in (pose, K))
         out = render(gaussians, camera, intrinsics, width, height)
-        alpha = out.alphas[0].numpy()
-        depth = np.where(alpha > 0.5, out.depths[0].numpy() / np.maximum(alpha, 1e-6), 0).astype(np.float32)
-        found.append(DepthView(pose, K, without_edges(depth), out.colors[0].clamp(0, 1).numpy()))
+        depth = without_edges(expected_depth(out).numpy())
+        found.append(DepthView(pose, K, depth, out.colors[0].clamp(0, 1).numpy()))
     return found
 
 

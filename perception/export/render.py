@@ -15,8 +15,7 @@ import torch
 from perception.errors import InputError
 from perception.frame.recentre import map_from_input, moved
 from perception.gaussians.model import Gaussians
-from perception.gaussians.render import render
-from perception.gaussians.views import depth_image
+from perception.gaussians.views import depth_image, render
 from perception.inputs.transforms import read_frames
 from perception.instances.silhouettes import render_silhouettes
 from perception.io.atomic import atomic_file

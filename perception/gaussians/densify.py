@@ -1,31 +1,51 @@
 """Adaptive density control: adds Gaussians by screen-space gradient up to a fixed budget, and prunes Gaussians.
 
-Small Gaussians are cloned and large ones split (Kerbl et al. 2023, §5.2), with three changes. Candidates are ranked by
-gradient, and only as many as the budget allows are used. The opacities of a clone and its original are corrected to
-preserve the rendered image (Rota Bulò et al. 2024, eq. 11). Opacities decay a little instead of being reset.
+Densification: small Gaussians are cloned and large ones split (Kerbl et al. 2023, §5.2), with three changes. Candidates
+are ranked by gradient, and only as many as the budget allows are used. The opacities of a clone and its original are
+corrected to preserve the rendered image (Rota Bulò et al. 2024, eq. 11). Opacities decay instead of being reset.
+
+Holes: densification only copies existing Gaussians, so regions that the map leaves empty are filled. Each view is
+divided into blocks of BLOCK × BLOCK pixels. An empty block gets one Gaussian of the block's size and the photo's mean
+colour there, at a depth taken from the nearest covered blocks. Training then moves it to the surface.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 
 from perception.gaussians.device import training_kernels
-from perception.gaussians.model import Gaussians, sigmoid
+from perception.gaussians.model import Gaussians, isotropic, sigmoid
+from perception.gaussians.views import TrainingView, render, unprojected
 
 START, STOP = 0.05, 0.6
 """Progress at which the number of Gaussians begins and ends to grow."""
 PERCENT_DENSE = 0.01
 """A Gaussian is split if its largest scale exceeds this share of the scene extent, else cloned (Kerbl et al. 2023)."""
 PRUNE_OPACITY = 0.005
+"""Opacity below which a Gaussian is removed (Kerbl et al. 2023)."""
+OPACITY_MARGIN = 1e-6
+"""Opacities are kept this far from 0 and 1, where logits are infinite."""
 OPACITY_DECAY = 1e-2
 """Share by which every opacity is reduced before each densification."""
 SPLIT_SHRINK = 1.6
 """Scales of the two halves of a split Gaussian are divided by this (Kerbl et al. 2023)."""
 BEYOND = 0.3
-"""Factor on the gradient of a Gaussian beyond the box for which a block of a large place is trained: it will be dropped
+"""Factor on the gradient of a Gaussian beyond the box for which a block of a large scene is trained: it will be dropped
 later, and is needed only for what photos show behind or beside the box."""
+
+BLOCK = 8
+"""Side of a block in pixels."""
+EMPTY = 0.5
+"""A block is empty when its mean opacity is below this."""
+NEIGHBOURS = 12
+"""Nearest covered blocks from which the depth of an empty one is taken."""
+FAR = 0.75
+"""Quantile of the depths of the nearest covered blocks that is used: regions without points are mostly background."""
+HOLE_OPACITY = 0.5
+"""Opacity of the Gaussians added."""
 
 
 @dataclass
@@ -42,20 +62,9 @@ class Statistics:
 
     def add(self, gradient_px: torch.Tensor, visible: torch.Tensor, long_side: int) -> None:
         """Adds one view: gradient_px [N, 2] of the 2D mean per pixel, visible [N] uint8, long_side in pixels. Rows that
-        are not visible are not looked at."""
+        are not visible are not read."""
         add_statistics = training_kernels(visible.device).add_statistics
         add_statistics(gradient_px, visible, self.gradient, self.seen, 0.5 * long_side)
-
-    def mean_gradient(self) -> torch.Tensor:
-        return self.gradient / self.seen.clamp(min=1)
-
-
-@dataclass(frozen=True)
-class Change:
-    """keep: indices [K] of rows that stay, in order; born: new Gaussians appended after them."""
-
-    keep: torch.Tensor
-    born: Gaussians
 
 
 def target_count(progress: float, initial: int, budget: int) -> int:
@@ -72,16 +81,17 @@ def densify(
     grad_threshold: float,
     seed: int,
     box: torch.Tensor | None = None,
-) -> Change:
+) -> tuple[torch.Tensor, Gaussians]:
     """Prunes, then clones or splits the best candidates while there are at most `allowed` Gaussians.
 
     extent: scene size in world units. grad_threshold: mean gradient (see Statistics) above which a Gaussian is
     cloned or split. box: [2, 3] corners of the part of space that matters, see BEYOND; None: all of it. Opacities of
-    cloned Gaussians change in place. Global random state is not used.
+    cloned Gaussians change in place. Returns the indices [K] int64 of the rows to keep, in order, and the Gaussians to
+    append.
     """
     needed = _needed(gaussians, statistics)
     room = max(0, allowed - int(needed.sum()))
-    score = statistics.mean_gradient()
+    score = statistics.gradient / statistics.seen.clamp(min=1)
     if box is not None:
         inside = ((gaussians.means >= box[0]) & (gaussians.means < box[1])).all(dim=1)
         score = torch.where(inside, score, BEYOND * score)
@@ -94,18 +104,21 @@ def densify(
     split, clone = candidates[large], candidates[~large]
 
     # Rota Bulò et al. 2024, eq. 11: clone and original get o' = 1 − sqrt(1 − o); both together have opacity o.
-    halved = _halved_logit(gaussians.opacity_logits[clone])
-    gaussians.opacity_logits[clone] = halved
+    opacities = sigmoid(gaussians.opacity_logits[clone]).clamp(max=1 - OPACITY_MARGIN)
+    gaussians.opacity_logits[clone] = _logit(1 - torch.sqrt(1 - opacities))
     needed[split] = False
     generator = torch.Generator().manual_seed(seed)
     born = Gaussians.concatenate([gaussians.rows(clone), *_halves(gaussians, split, generator)])
-    return Change(torch.nonzero(needed).flatten(), born)
+    return torch.nonzero(needed).flatten(), born
 
 
 def decay_opacities(gaussians: Gaussians) -> None:
     """Multiplies every opacity by 1 − OPACITY_DECAY in place. Gaussians that no photo supports fade and are pruned."""
-    opacities = gaussians.opacities * (1 - OPACITY_DECAY)
-    gaussians.opacity_logits.copy_(torch.logit(opacities.clamp(1e-6, 1 - 1e-6)))
+    gaussians.opacity_logits.copy_(_logit(gaussians.opacities * (1 - OPACITY_DECAY)))
+
+
+def _logit(opacities: torch.Tensor) -> torch.Tensor:
+    return torch.logit(opacities.clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN))
 
 
 def _needed(gaussians: Gaussians, statistics: Statistics) -> torch.Tensor:
@@ -114,11 +127,6 @@ def _needed(gaussians: Gaussians, statistics: Statistics) -> torch.Tensor:
         unseen = torch.zeros_like(unseen)
     finite = torch.isfinite(gaussians.means).all(dim=1) & torch.isfinite(gaussians.log_scales).all(dim=1)
     return (gaussians.opacities >= PRUNE_OPACITY) & ~unseen & finite
-
-
-def _halved_logit(logits: torch.Tensor) -> torch.Tensor:
-    opacities = 1 - torch.sqrt(1 - sigmoid(logits).clamp(max=1 - 1e-6))
-    return torch.logit(opacities.clamp(1e-6, 1 - 1e-6))
 
 
 def _halves(gaussians: Gaussians, index: torch.Tensor, generator: torch.Generator) -> list[Gaussians]:
@@ -145,3 +153,70 @@ def rotation_matrices(quats: torch.Tensor) -> torch.Tensor:
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     ]  # fmt: skip
     return torch.stack(rows, dim=1).reshape(-1, 3, 3)
+
+
+@torch.no_grad()
+def fill_holes(gaussians: Gaussians, views: list[TrainingView], room: int, seed: int) -> tuple[Gaussians, float]:
+    """At most `room` new Gaussians for the empty blocks of `views`, and the share of all blocks that was empty.
+
+    Each view is rendered with the Gaussians added for the views before it, so a hole seen in several is filled once.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    born, empty, blocks = gaussians.rows(torch.zeros(0, dtype=torch.long)), 0, 0
+    for view in views:
+        alphas, depths = _blocks(Gaussians.concatenate([gaussians, born]), view)
+        holes = alphas < EMPTY
+        covered = ~holes
+        if view.weight is not None:
+            holes &= _block_mean(view.weight[None])[0].numpy() > 0.999  # no colour of an ignored pixel
+        empty, blocks = empty + int(holes.sum()), blocks + alphas.size
+        if not holes.any() or not covered.any() or len(born) >= room:
+            continue
+        new = _in_holes(view, holes, covered, depths, gaussians, generator).to(gaussians.means.device)
+        born = Gaussians.concatenate([born, new.rows(torch.arange(min(len(new), room - len(born))))])
+    return born, empty / max(1, blocks)
+
+
+def _blocks(gaussians: Gaussians, view: TrainingView) -> tuple[np.ndarray, np.ndarray]:
+    """Mean opacity of each block [h, w], and its opacity-weighted mean depth [h, w], 0 where the opacity is 0."""
+    height, width = view.photo.shape[:2]
+    out = render(gaussians, view.camera_from_world, view.K, width, height, eps2d=view.eps2d)
+    assert out.depths is not None  # for the type checker
+    alpha, depth = _block_mean(torch.stack([out.alphas[0], out.depths[0]])).cpu().numpy()
+    return alpha, np.where(alpha > 0, depth / np.maximum(alpha, 1e-6), 0)
+
+
+def _block_mean(images: torch.Tensor) -> torch.Tensor:
+    return torch.nn.functional.avg_pool2d(images[None], BLOCK, ceil_mode=True)[0]
+
+
+def _in_holes(
+    view: TrainingView,
+    holes: np.ndarray,
+    covered: np.ndarray,
+    depths: np.ndarray,
+    like: Gaussians,
+    generator: torch.Generator,
+) -> Gaussians:
+    """One Gaussian for each True block of holes [h, w], by depths of the `covered` ones; tensors like `like`."""
+    from scipy.spatial import cKDTree
+
+    known, empty = np.argwhere(covered), np.argwhere(holes)
+    count = min(NEIGHBOURS, len(known))
+    _, near = cKDTree(known).query(empty, k=count)
+    around = depths[covered][near.reshape(len(empty), count)]
+    depth = np.quantile(around, FAR, axis=1).astype(np.float32)
+
+    height, width = view.photo.shape[:2]
+    low = empty * BLOCK
+    high = np.minimum(low + BLOCK, [height, width])
+    rows, columns = ((low + high) / 2).T
+    K = view.K.numpy()
+    means = unprojected(K, view.camera_from_world.double().numpy(), columns, rows, depth)
+    colors = _block_mean(view.photo.float().permute(2, 0, 1))
+    rgb = colors[:, torch.from_numpy(holes)].T / 255
+    scales = torch.from_numpy(depth) * (0.5 * BLOCK / float(K[0, 0]))
+    log_scales = scales.clamp(min=1e-9).log()
+    balls = isotropic(means, log_scales, rgb, HOLE_OPACITY, like.features.shape[1], generator)
+    harmonics = balls.sh.new_zeros(len(empty), like.sh.shape[1] - 1, 3)
+    return replace(balls, sh=torch.cat([balls.sh, harmonics], dim=1))

@@ -23,6 +23,9 @@ SAMPLES = 1_500_000
 FINEST = 2.0
 """Least voxel side in pixel footprints at the median depth."""
 LEAST_PIXELS = 2
+"""Samples that a voxel needs: fewer are mostly noise."""
+REACH = 4
+"""Pixels to either side between which the slope of the surface is measured."""
 AGREE = 0.04
 """Relative difference of depths up to which a view sees a voxel. If its depth is larger, it looks through the voxel."""
 STEEPEST = 0.2
@@ -114,15 +117,18 @@ def _samples(view: TrainingView, every: int) -> tuple[np.ndarray, np.ndarray, np
     return points, view.photo.numpy()[row, column], depth**-4.0, depth / K[0, 0]
 
 
-def _facing(z: np.ndarray, K: np.ndarray, reach: int = 4) -> np.ndarray:
-    """[h, w] cosine between ray and surface normal, from differences over `reach` pixels; 1 where one is missing."""
+def _facing(z: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """[H, W] cosine between ray and surface normal, from depths z [H, W]; 1 where a depth at ± REACH pixels is missing.
+
+    cos = 1 / √(1 + s_x² + s_y²), s_x = f_x / z ∂z/∂x the slope along the image's columns, f_x the focal length.
+    """
     slopes = []
     for axis, focal in ((0, K[1, 1]), (1, K[0, 0])):
-        ahead, behind = np.roll(z, -reach, axis), np.roll(z, reach, axis)
+        ahead, behind = np.roll(z, -REACH, axis), np.roll(z, REACH, axis)
         known = (ahead > 0) & (behind > 0)
-        for image, edge in ((known, slice(None, reach)), (known, slice(-reach, None))):
-            np.moveaxis(image, axis, 0)[edge] = False
-        slopes.append(np.where(known, (ahead - behind) * focal / (2 * reach * np.where(z > 0, z, 1)), 0))
+        for edge in (slice(None, REACH), slice(-REACH, None)):
+            np.moveaxis(known, axis, 0)[edge] = False
+        slopes.append(np.where(known, (ahead - behind) * focal / (2 * REACH * np.where(z > 0, z, 1)), 0))
     return 1 / np.sqrt(1 + slopes[0] ** 2 + slopes[1] ** 2)
 
 

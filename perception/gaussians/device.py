@@ -26,7 +26,7 @@ def training_kernels(device: torch.device) -> Any:
 def choose_device(wanted: Literal["auto", "cpu", "cuda"]) -> tuple[torch.device, str | None]:
     """The device for `wanted`, and a line for the user: the GPU's name, or why "auto" leaves a GPU alone.
 
-    InputError for "cuda" where no GPU can be used: with what was found, and what is needed.
+    InputError for "cuda" where no GPU can be used.
     """
     if wanted == "cpu" or (wanted == "auto" and torch.version.cuda is None and not _has_driver()):
         return torch.device("cpu"), None
@@ -40,7 +40,7 @@ def choose_device(wanted: Literal["auto", "cpu", "cuda"]) -> tuple[torch.device,
 
 
 def _has_driver() -> bool:
-    from perception.rasterizer.cuda.launch import load_driver
+    from perception.rasterizer.cuda.kernels import load_driver
 
     with suppress(InputError):
         load_driver()

@@ -24,12 +24,12 @@ HARMONICS_GAIN = 0.05
 class EarlyStopping:
     """Measurements and decisions so far. All fields are plain values and are stored in the checkpoint.
 
-    asked_db: gain in dB required of 10 % more time. scores, counts: PSNR in dB and number of Gaussians at the end of
+    required_db: gain in dB required of 10 % more time. scores, counts: PSNR in dB and number of Gaussians at the end of
     each trial. growing: Gaussians may be added. degree_decided: the degree of harmonics is final. finished: only the
     cool-down is left. due: progress at which the next trial ends.
     """
 
-    asked_db: float
+    required_db: float
     scores: list[float] = field(default_factory=list)
     counts: list[int] = field(default_factory=list)
     growing: bool = True
@@ -58,11 +58,11 @@ class EarlyStopping:
         if next_count <= gaussians:
             return None
         tenths = ((next_count / gaussians) ** COST_EXPONENT - 1) / 0.1
-        asked = self.asked_db * tenths
-        if gain / 2 >= asked:
+        required = self.required_db * tenths
+        if gain / 2 >= required:
             return None
         self.growing = False
-        return f"growth: ended at {gaussians} Gaussians, a trial gains {gain / 2:.3f} dB and {asked:.3f} are asked"
+        return f"growth: ended at {gaussians} Gaussians, a trial gains {gain / 2:.3f} of {required:.3f} dB required"
 
     def plateau(self, progress: float) -> str | None:
         """Why training should end early, after a few steps at falling rates; None while it still gains enough."""
@@ -70,9 +70,9 @@ class EarlyStopping:
         if gain is None:
             return None
         tenths = 2 * TRIAL / (0.1 * progress)
-        if gain >= self.asked_db * tenths:
+        if gain >= self.required_db * tenths:
             return None
-        return f"stop: 10 % more time gains {gain / tenths:.3f} dB, {self.asked_db:g} are asked"
+        return f"stop: 10 % more time gains {gain / tenths:.3f} of {self.required_db:g} dB required"
 
     def next_degree(self, degree: int, highest: int, score: Callable[[int], float]) -> tuple[int, str | None]:
         """The degree of spherical harmonics after a trial, and the decision as text, or None.

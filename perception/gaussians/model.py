@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,19 +85,32 @@ class Gaussians:
         """[N, 3] RGB in about [0, 1] as seen without view dependence."""
         return rgb_from_sh(self.sh[:, 0])
 
-    def inputs(self, camera_from_world: torch.Tensor, K: torch.Tensor, features: torch.Tensor | None = None) -> Inputs:
-        """The inputs of the rasterizer for one camera, with colours that do not depend on the view.
-        camera_from_world [4, 4], K [3, 3] pixels, on any device; features [N, D], where the Gaussians are."""
+    def inputs(
+        self,
+        camera_from_world: torch.Tensor,
+        K: torch.Tensor,
+        features: torch.Tensor | None = None,
+        *,
+        harmonics: bool = False,
+        background: torch.Tensor | None = None,
+    ) -> Inputs:
+        """The inputs of the rasterizer for one camera: camera_from_world [4, 4], K [3, 3] pixels, background [1, 3], on
+        any device; features [N, D], where the Gaussians are.
+
+        harmonics: colours depend on the view. False uses the constant term, which is enough for visibility, depth and
+        features.
+        """
         device = self.means.device
         return Inputs(
             means=self.means,
             quats=self.quats,
             scales=self.scales,
             opacities=self.opacities,
-            colors=self.base_colors,
+            colors=self.sh if harmonics else self.base_colors,
             viewmats=camera_from_world[None].contiguous().to(device),
             Ks=K[None].contiguous().to(device),
             features=features,
+            background=None if background is None else background.to(device),
         )
 
 
@@ -121,14 +135,49 @@ def from_points(
     spacing = np.clip(np.where(spacing > 0, spacing, typical), 1e-3 * typical, 10 * typical)
 
     generator = torch.Generator().manual_seed(seed)
-    count = len(points)
-    quats = torch.zeros(count, 4)
+    rgb = torch.from_numpy(np.ascontiguousarray(colors)).float() / 255
+    log_scales = torch.from_numpy(np.log(spacing).astype(np.float32))
+    return isotropic(points, log_scales, rgb, opacity, feature_dim, generator)
+
+
+def isotropic(
+    points: np.ndarray,
+    log_scales: torch.Tensor,
+    rgb: torch.Tensor,
+    opacity: float,
+    feature_dim: int,
+    generator: torch.Generator,
+) -> Gaussians:
+    """Balls of one opacity at points [P, 3], log_scales [P], rgb [P, 3] in [0, 1], with random features."""
+    quats = torch.zeros(len(points), 4)
     quats[:, 0] = 1.0
     return Gaussians(
         means=torch.from_numpy(points.astype(np.float32)),
         quats=quats,
-        log_scales=torch.from_numpy(np.log(spacing).astype(np.float32))[:, None].repeat(1, 3),
-        opacity_logits=torch.full((count,), math.log(opacity / (1 - opacity))),
-        sh=sh_from_rgb(torch.from_numpy(np.ascontiguousarray(colors)).float() / 255)[:, None, :],
-        features=torch.rand(count, feature_dim, generator=generator) - 0.5,
+        log_scales=log_scales[:, None].repeat(1, 3),
+        opacity_logits=torch.full((len(points),), math.log(opacity / (1 - opacity))),
+        sh=sh_from_rgb(rgb)[:, None],
+        features=torch.rand(len(points), feature_dim, generator=generator) - 0.5,
     )
+
+
+class Nearby:
+    """A model on the device that is to render it; of a scene trained in blocks, a photo is shown only those around it.
+
+    rows: by photo, those of the Gaussians it may show, int64 arrays to be joined, in one list for all photos that show
+    the same ones. A photo that is not listed may show all Gaussians.
+    """
+
+    def __init__(self, gaussians: Gaussians, rows: Mapping[str, Sequence[np.ndarray]] | None = None) -> None:
+        self.gaussians, self._rows = gaussians, rows or {}
+        self._all = [np.arange(len(gaussians))]
+        self._last: tuple[Sequence[np.ndarray], Gaussians, np.ndarray] = self._all, gaussians, self._all[0]
+
+    def of(self, photo: str) -> tuple[Gaussians, np.ndarray]:
+        """The Gaussians near a photo, and their rows in the model."""
+        parts = self._rows.get(photo, self._all)
+        if parts is not self._last[0]:
+            rows = np.concatenate(parts)
+            chosen = torch.from_numpy(rows).to(self.gaussians.means.device)
+            self._last = parts, self.gaussians if parts is self._all else self.gaussians.rows(chosen), rows
+        return self._last[1:]

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from perception.errors import InputError
 from perception.gaussians.device import training_kernels
 
 Rate = float | Tensor
@@ -19,9 +18,7 @@ BETAS, EPS = (0.9, 0.999), 1e-15
 class SparseAdam:
     """Adam (Kingma & Ba 2015) on the rows a mask selects, for tensors that grow and shrink together.
 
-    params: name -> [N, ...] float32 or float64 tensors on one device, the same N for all; updated in place.
-    rates: name -> learning rate, or a tensor of one rate per column, shaped like a row ([...]), so that for
-    example the DC and the higher spherical harmonics share a tensor and still learn at different speeds.
+    params: name -> [N, ...] contiguous float32 or float64 tensors on one device, the same N for all; updated in place.
 
     Semantics of the mask:
     - A selected row is updated as dense Adam would, also when its gradient is 0: its moments decay,
@@ -34,50 +31,34 @@ class SparseAdam:
     With every row selected and every gradient finite this equals torch.optim.Adam(eps=1e-15) up to rounding.
     """
 
-    def __init__(self, params: Mapping[str, Tensor], rates: Mapping[str, Rate]) -> None:
-        self.params = {name: _checked(name, tensor) for name, tensor in params.items()}
-        self.rates: dict[str, Rate] = dict(rates)
+    def __init__(self, params: Mapping[str, Tensor]) -> None:
+        self.params = dict(params)
         self.steps = 0
         self._first = {name: torch.zeros_like(t) for name, t in self.params.items()}
         self._second = {name: torch.zeros_like(t) for name, t in self.params.items()}
 
-    def __len__(self) -> int:
-        """N, the number of rows."""
-        return len(next(iter(self.params.values()))) if self.params else 0
+    def step(
+        self, rates: Mapping[str, Rate], grads: Mapping[str, Tensor | None], visible: Tensor | None = None
+    ) -> dict[str, int]:
+        """One step of the rows where visible [N] uint8 is not 0; None: of all. grads: name -> [N, ...].
 
-    def step(self, visible: Tensor | None, grads: Mapping[str, Tensor | None]) -> dict[str, int]:
-        """One step. visible: [N] bool or uint8, None for all. grads: name -> [N, ...].
-
-        Tensors without a gradient are not updated; the global step count increases by one for all. Returns how many
-        rows of each other one were skipped for a gradient with NaN or infinity, as a tensor where it is not on the CPU.
+        rates: name -> learning rate, or a tensor of one rate per column, shaped like a row ([...]): the constant term
+        and the higher spherical harmonics share a tensor and have different rates.
+        Tensors without a gradient are not updated; the global step count increases by one for all. Returns the number
+        of rows of each other one skipped for a gradient with NaN or infinity, as a tensor where it is not on the CPU.
         """
-        if visible is not None:
-            if visible.shape != (len(self),):
-                raise InputError(f"SparseAdam: visible has shape {list(visible.shape)}, expected [{len(self)}]")
-            visible = visible.detach().to(torch.uint8).contiguous()
         self.steps += 1
         skipped = {}
         for name, param in self.params.items():
-            if (grad := grads.get(name)) is not None:
-                skipped[name] = self._step_one(name, param, grad, visible)
-        return skipped
-
-    def _step_one(self, name: str, param: Tensor, grad: Tensor, visible: Tensor | None) -> int:
-        if grad.shape != param.shape or grad.dtype != param.dtype:
-            found = f"{list(grad.shape)} {grad.dtype}"
-            raise InputError(f"SparseAdam: gradient of {name} is {found}, expected {list(param.shape)} {param.dtype}")
-        if not param.numel():
-            return 0
-        rows = (len(param), -1)
-        tensors = (param, grad.contiguous(), self._first[name], self._second[name])
-        matrices = [t.view(rows) for t in tensors]
-        width = matrices[0].shape[1]
-        rate = np.asarray(self.rates[name], dtype=np.float64).reshape(-1)
-        if rate.size not in (1, width):
-            raise InputError(f"SparseAdam: rates of {name} are {rate.size}, expected 1 or {width}")
-        rate = np.ascontiguousarray(np.broadcast_to(rate, width))
-        adam = training_kernels(param.device).adam
-        skipped: int = adam(*matrices, visible, rate, self.steps, *BETAS, EPS)
+            grad = grads.get(name)
+            if grad is None or not param.numel():
+                continue
+            tensors = (param, grad.contiguous(), self._first[name], self._second[name])
+            matrices = [tensor.view(len(param), -1) for tensor in tensors]
+            rate = np.asarray(rates[name], dtype=np.float64).reshape(-1)
+            rate = np.ascontiguousarray(np.broadcast_to(rate, matrices[0].shape[1]))
+            adam = training_kernels(param.device).adam
+            skipped[name] = adam(*matrices, visible, rate, self.steps, *BETAS, EPS)
         return skipped
 
     def keep(self, index: Tensor) -> None:
@@ -103,26 +84,17 @@ class SparseAdam:
                 table[name] = torch.cat([table[name], torch.zeros_like(new)])
 
     def state_dict(self, copy: bool = True) -> dict[str, Any]:
-        """Everything needed to continue: params and moments on the CPU, rates, step count. copy: of what is there now,
-        else, on the CPU, the tensors themselves, which the next step changes."""
+        """Everything needed to continue: params and moments on the CPU, step count. Without `copy`, tensors that are on
+        the CPU are returned themselves, and the next step changes them."""
         tables = {"params": self.params, "first": self._first, "second": self._second}
         copies: dict[str, Any] = {
             key: {name: t.to("cpu", copy=copy) for name, t in table.items()} for key, table in tables.items()
         }
-        return copies | {"rates": dict(self.rates), "steps": self.steps}
+        return copies | {"steps": self.steps}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores a `state_dict` of the same names; the number of rows may differ."""
         for table, key in ((self.params, "params"), (self._first, "first"), (self._second, "second")):
             for name, tensor in state[key].items():
                 table[name] = tensor.to(table[name].device, copy=True).contiguous()
-        self.rates = dict(state["rates"])
         self.steps = state["steps"]
-
-
-def _checked(name: str, tensor: Tensor) -> Tensor:
-    fine = tensor.dtype in (torch.float32, torch.float64) and not tensor.requires_grad
-    if not fine or tensor.ndim < 1 or not tensor.is_contiguous():
-        found = f"{tensor.dtype} {list(tensor.shape)}, requires_grad={tensor.requires_grad}"
-        raise InputError(f"SparseAdam: {name} is {found}, expected contiguous floats [N, ...] without a gradient")
-    return tensor

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect
 from dataclasses import replace
+from itertools import compress
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -22,29 +23,22 @@ from perception.types import Scene, View
 
 
 def split_scene(scene: Scene, options: PhotoConfig) -> tuple[Scene, list[View], list[View]]:
-    """(the scene with its views sorted by name, training views, held-out views as exposed as their neighbours)."""
-    training, held_out = split_views(scene.views, options.holdout, options.held_out)
-    held_out = exposed_as_neighbours(held_out, training)
-    return replace(scene, views=sorted([*training, *held_out], key=lambda view: view.name)), training, held_out
+    """(the scene with its views sorted by name, training views, held-out views as exposed as their neighbours).
 
-
-def split_views(views: list[View], holdout: int, listed: str | None = None) -> tuple[list[View], list[View]]:
-    """(training, held out), sorted by name: index % holdout == 0 is held out; none with holdout 0 or a single view.
-
-    listed: a text file that names the held-out photos instead, one per line.
+    Held out are the views that the file `options.held_out` names, or every `options.holdout`-th: none with a holdout of
+    1 or 0, or of fewer than 4 views. InputError for a file that cannot be read or leaves no view to train on.
     """
+    views, listed, every = scene.views, options.held_out, options.holdout
     if listed is not None:
         names = _names(Path(listed))
-        named = [bool(names & {view.name, PurePosixPath(view.name).stem}) for view in views]
-        if all(named):
+        held = [bool(names & {view.name, PurePosixPath(view.name).stem}) for view in views]
+        if all(held):
             raise InputError(f"{listed}: names all {len(views)} photos; some must be left to train on")
-        return [v for v, is_held in zip(views, named, strict=True) if not is_held], [
-            v for v, is_held in zip(views, named, strict=True) if is_held
-        ]
-    if holdout <= 1 or len(views) < 4:
-        return list(views), []
-    held = [view for i, view in enumerate(views) if i % holdout == 0]
-    return [view for i, view in enumerate(views) if i % holdout != 0], held
+    else:
+        held = [every > 1 and len(views) >= 4 and index % every == 0 for index in range(len(views))]
+    training = list(compress(views, [not is_held for is_held in held]))
+    held_out = exposed_as_neighbours(list(compress(views, held)), training)
+    return replace(scene, views=sorted([*training, *held_out], key=lambda view: view.name)), training, held_out
 
 
 def _names(listed: Path) -> set[str]:
@@ -62,8 +56,8 @@ def exposed_as_neighbours(held_out: list[View], training: list[View]) -> list[Vi
     names = [view.name for view in training]
     exposed = []
     for view in held_out:
-        place = bisect(names, view.name)
-        near = [other.gain for other in training[max(place - 1, 0) : place + 1] if other.gain is not None]
+        after = bisect(names, view.name)
+        near = [other.gain for other in training[max(after - 1, 0) : after + 1] if other.gain is not None]
         gain = None if view.gain is None or not near else tuple(np.exp(np.log(near).mean(axis=0)).tolist())
         exposed.append(replace(view, gain=gain))
     return exposed

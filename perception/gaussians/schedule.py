@@ -1,11 +1,14 @@
-"""Training schedule as a function of progress: next view, densification, spherical harmonics, early stopping.
+"""Training schedule as a function of progress: learning rates, next view, densification, harmonics, early stopping.
 
 progress   0 ─ .05 ───── .3 ─ .4 ─── .6 ────────── .9 ── 1
 photos     half size          │ full size (small photos: from .15)
 features                 │      rendered every 3rd step (`losses.start`, `losses.every`)
 growth         densified every 100 steps, holes filled
 harmonics                            one more degree per trial, then unneeded degrees are removed
-rates                                              cool down
+rates                                              decrease to a twentieth
+
+A step of Adam is about as long as the rate, so in fewer iterations a parameter can move less far. The rates of means
+and rotations make up for that: they are times sqrt(2000 / iterations).
 """
 
 from __future__ import annotations
@@ -15,12 +18,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from perception.gaussians.densify import START, STOP, decay_opacities, densify, target_count
+from perception.gaussians.densify import START, STOP, decay_opacities, densify, fill_holes, target_count
 from perception.gaussians.early_stopping import TRIAL
-from perception.gaussians.holes import fill_holes
 from perception.gaussians.losses import photometric
-from perception.gaussians.rates import COOLDOWN
-from perception.gaussians.state import TrainingState
+from perception.gaussians.optimiser import Rate
+from perception.gaussians.state import ITERATIONS, TrainingState
 from perception.gaussians.views import TrainingView, psnr, render_view, visible_in
 
 COARSE_UNTIL, COARSE_UNTIL_SMALL, LARGE = 0.4, 0.15, 400
@@ -33,8 +35,49 @@ FILL_EVERY = 5
 """Every FILL_EVERY-th densification also adds Gaussians in image regions that the map leaves empty."""
 FEATURES_NEED = 0.35
 """Share of training progress for which features are trained before early stopping is allowed."""
+COOLDOWN = 0.1
+"""Final share of training progress, over which all rates decrease to a twentieth."""
 SCORED, NOTED = 8, 6
 """Maximum number of held-out views scored at the end of a trial, and for one point of the quality curve."""
+
+MEANS, MEANS_LAST = 8e-4, 2e-5
+"""Rates of the means at the start and at the end, times the scene extent, for ITERATIONS. Kerbl et al. 2023 have 1.6e-4
+and 1.6e-6 for 30,000 iterations."""
+QUATS = 4e-3
+"""For ITERATIONS; for 30,000 it is that of Kerbl et al., 1e-3."""
+LARGEST_FACTOR = 2.0
+"""Largest factor of these rates in shorter runs."""
+SCALES = 1e-2
+"""Rate of the log-scales: twice that of Kerbl et al. COLORS is also twice theirs, HARMONICS eight times theirs."""
+OPACITIES = 0.05
+COLORS, HARMONICS = 5e-3, 1e-3
+FEATURES = 2e-2
+
+
+def learning_rates(progress: float, extent: float, coefficients: int, iterations: int) -> dict[str, Rate]:
+    """Learning rates of the tensors of `Gaussians` at `progress` in [0, 1]; of sh one per entry, [coefficients, 3].
+
+    extent: scene size in world units. coefficients: number of spherical-harmonic coefficients of a Gaussian.
+    iterations: of all the training.
+    """
+    cool, factor = cooling(progress), min(LARGEST_FACTOR, (ITERATIONS / iterations) ** 0.5)
+    sh = torch.full((coefficients, 3), cool * HARMONICS)
+    sh[0] = cool * COLORS
+    return {
+        "means": cool * factor * MEANS * (MEANS_LAST / MEANS) ** progress * extent,
+        "quats": cool * factor * QUATS,
+        "log_scales": cool * SCALES,
+        "opacity_logits": cool * OPACITIES,
+        "sh": sh,
+        "features": cool * FEATURES,
+    }
+
+
+def cooling(progress: float) -> float:
+    """Factor of all rates at `progress`: 1, then half a cosine from 1 to 0.05 over the last COOLDOWN of training."""
+    if progress <= 1 - COOLDOWN:
+        return 1.0
+    return 0.05 + 0.95 * 0.5 * (1 + float(np.cos(np.pi * (progress - 1 + COOLDOWN) / COOLDOWN)))
 
 
 def next_view(state: TrainingState, progress: float) -> tuple[TrainingView, bool]:
@@ -64,7 +107,7 @@ def after_step(state: TrainingState, progress: float, may_stop: bool) -> None:
     if due:
         _densify_and_judge(state, progress)
     if state.iteration % (5 * every) == 0 and state.progress < 1.0:
-        _note(state, progress)
+        _add_to_curve(state, progress)
     if due and may_stop:
         _stop_early(state)
 
@@ -72,7 +115,7 @@ def after_step(state: TrainingState, progress: float, may_stop: bool) -> None:
 def finish(state: TrainingState) -> None:
     """Prunes and records the final quality; called once, when training is complete."""
     _prune(state)
-    _note(state, state.progress)
+    _add_to_curve(state, state.progress)
 
 
 def _densify_and_judge(state: TrainingState, progress: float) -> None:
@@ -106,9 +149,9 @@ def _densify(state: TrainingState, progress: float) -> None:
 def _grow(state: TrainingState, allowed: int, seed: int) -> None:
     decay_opacities(state.gaussians)
     threshold = state.config.densify.grad_threshold
-    change = densify(state.gaussians, state.statistics, allowed, state.extent, threshold, seed, state.box)
-    state.keep(change.keep)
-    state.append(change.born)
+    kept, born = densify(state.gaussians, state.statistics, allowed, state.extent, threshold, seed, state.box)
+    state.keep(kept)
+    state.append(born)
 
 
 def _fill(state: TrainingState, seed: int) -> None:
@@ -117,7 +160,7 @@ def _fill(state: TrainingState, seed: int) -> None:
         born, empty = fill_holes(state.gaussians, state.coarse, room, seed)
         state.append(born)
         if len(born):
-            _tell(state, f"holes: {empty:.2%} of the pictures were empty, {len(born)} Gaussians placed there")
+            _note(state, f"holes: {empty:.2%} of the images were empty, {len(born)} Gaussians added there")
 
 
 def _prune(state: TrainingState) -> None:
@@ -134,7 +177,7 @@ def _prune(state: TrainingState) -> None:
 def _keep(state: TrainingState, wanted: torch.Tensor, which: str) -> None:
     """Keeps the Gaussians where wanted [N] bool is True; `which` describes the others in the record."""
     if not bool(wanted.all()):
-        _tell(state, f"pruned: {int((~wanted).sum())} Gaussians {which}")
+        _note(state, f"pruned: {int((~wanted).sum())} Gaussians {which}")
         state.keep(torch.nonzero(wanted).flatten())
         state.reset_statistics()
 
@@ -148,16 +191,16 @@ def _end_trial(state: TrainingState, reached: float) -> None:
     stopping.counts.append(count)
     if grows_at(state, progress):
         if progress > JUDGED_FROM:
-            _tell(state, stopping.growth_pays(_allowed(state, progress + TRIAL)))
+            _note(state, stopping.growth_pays(_allowed(state, progress + TRIAL)))
         return
     if stopping.growing:
         stopping.growing = False
-        _tell(state, f"growth: {count} of at most {state.config.train.budget} Gaussians")
+        _note(state, f"growth: {count} of at most {state.config.train.budget} Gaussians")
     if not stopping.degree_decided:
-        degree, told = stopping.next_degree(
+        degree, decision = stopping.next_degree(
             state.gaussians.sh_degree, state.config.train.sh_degree, lambda d: score(state, SCORED, degree=d)["psnr"]
         )
-        _tell(state, told)
+        _note(state, decision)
         if degree != state.gaussians.sh_degree:
             state.set_degree(degree)
 
@@ -171,7 +214,7 @@ def _stop_early(state: TrainingState) -> None:
         stopping.finished, stopping.growing = True, False
         left = 1.0 - COOLDOWN - progress
         state.skipped += left
-        _tell(state, f"{reason}; {left:.0%} of the course left out")
+        _note(state, f"{reason}; {left:.0%} of the training skipped")
 
 
 def _may_stop(state: TrainingState, progress: float) -> bool:
@@ -180,7 +223,7 @@ def _may_stop(state: TrainingState, progress: float) -> bool:
     return needed <= progress < 1.0 - COOLDOWN - TRIAL
 
 
-def _tell(state: TrainingState, decision: str | None) -> None:
+def _note(state: TrainingState, decision: str | None) -> None:
     if decision is not None:
         state.record.decisions.append(decision)
 
@@ -203,7 +246,7 @@ def score(state: TrainingState, limit: int, with_ssim: bool = False, degree: int
     return dict(zip(("psnr", "ssim"), np.mean(figures, axis=0).tolist(), strict=False))
 
 
-def _note(state: TrainingState, progress: float) -> None:
+def _add_to_curve(state: TrainingState, progress: float) -> None:
     """Appends one point to the quality curve of the record."""
     figures = score(state, NOTED, with_ssim=True)
     state.record.curve.append(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
@@ -17,11 +18,27 @@ from perception.gaussians.early_stopping import EarlyStopping
 from perception.gaussians.losses import LabelAssignment, assign_labels
 from perception.gaussians.model import STORED, Gaussians
 from perception.gaussians.optimiser import SparseAdam
-from perception.gaussians.rates import learning_rates
-from perception.gaussians.size import sized
 from perception.gaussians.views import TrainingView, scene_extent
 from perception.progress import timed
 from perception.rasterizer.types import Gradients
+
+USUAL_PHOTOS = 43
+"""Training photos of a table or a small room, for which ITERATIONS and BUDGET were chosen; fewer need as many."""
+ITERATIONS, BUDGET = 2000, 100_000
+
+
+def sized(config: MapConfig, photos: int, most: int | None = None) -> MapConfig:
+    """`config` with iterations and budget of Gaussians for a number of training photos, where they are 0.
+
+    Times `train.effort`, both are ITERATIONS and BUDGET for USUAL_PHOTOS or fewer, and proportional to the photos
+    beyond. Growth ends before the budget, and training before its end, where more does not pay (`train.exchange_db`).
+    most: largest budget that is chosen.
+    """
+    share = config.train.effort * max(1.0, photos / USUAL_PHOTOS)
+    iterations = config.train.iterations or max(1, round(ITERATIONS * share))
+    budget = config.train.budget or max(100, min(round(BUDGET * share), sys.maxsize if most is None else most))
+    train = config.train.model_copy(update={"iterations": iterations, "budget": budget})
+    return config.model_copy(update={"train": train})
 
 
 @dataclass
@@ -42,13 +59,13 @@ class TrainRecord:
     @staticmethod
     def joined(records: Sequence[TrainRecord]) -> TrainRecord:
         """The record of a model that was trained in blocks: sums, and the decisions of each; it has no curve."""
-        whole = TrainRecord()
+        total = TrainRecord()
         for number, record in enumerate(records, start=1):
-            whole.decisions += [f"block {number}: {told}" for told in record.decisions]
-            whole.profile = {part: whole.profile.get(part, 0.0) + s for part, s in record.profile.items()}
+            total.decisions += [f"block {number}: {decision}" for decision in record.decisions]
+            total.profile = {part: total.profile.get(part, 0.0) + s for part, s in record.profile.items()}
             for name in ("pairs", "seconds", "iterations", "skipped_gradients"):
-                setattr(whole, name, getattr(whole, name) + getattr(record, name))
-        return whole
+                setattr(total, name, getattr(total, name) + getattr(record, name))
+        return total
 
     def timed(self, part: str) -> AbstractContextManager[None]:
         """Adds the wall-clock seconds of its block to `part` of the profile. A nested block counts in both parts."""
@@ -85,7 +102,7 @@ class TrainingState:
         self.initial_count = len(gaussians)
         self.gaussians = gaussians.to(self.device)
         self.reset_statistics()
-        self.optimiser = SparseAdam(self.gaussians.named(), self.rates(0.0))
+        self.optimiser = SparseAdam(self.gaussians.named())
         self._sync()
         self.show(views)
         self._since: float | None = None  # time.monotonic() at the start of `running`, None outside
@@ -98,18 +115,22 @@ class TrainingState:
         return self.record.seconds + (0.0 if self._since is None else time.monotonic() - self._since)
 
     @property
+    def _share(self) -> float:
+        """Share of the iterations done or skipped."""
+        return self.iteration / self.config.train.iterations + self.skipped
+
+    @property
     def progress(self) -> float:
-        share = self.iteration / self.config.train.iterations + self.skipped
         limit = self.config.train.time_limit
-        return min(1.0, share if limit is None else max(share, self.elapsed / limit))
+        return min(1.0, self._share if limit is None else max(self._share, self.elapsed / limit))
 
     @property
     def expected_iterations(self) -> int:
         """Estimate of the total number of iterations of the run."""
-        share = self.iteration / self.config.train.iterations + self.skipped
-        if self.progress > share:  # the time limit determines progress
-            return max(self.iteration, round(self.iteration / max(self.progress, 1e-6)))
-        return round(self.iteration + (1 - self.progress) * self.config.train.iterations)
+        progress = self.progress
+        if progress > self._share:  # the time limit determines progress
+            return max(self.iteration, round(self.iteration / max(progress, 1e-6)))
+        return round(self.iteration + (1 - progress) * self.config.train.iterations)
 
     # ------------------------------------------------------------------- views
 
@@ -118,17 +139,17 @@ class TrainingState:
         self.views, self.coarse = views, [view.halved().stored() for view in views]
         self.long_side = max(max(view.photo.shape[:2]) for view in views)
         self.has_labels = any(view.labels is not None and bool((view.labels > 0).any()) for view in views)
-        self._placed: dict[tuple[str, int], TrainingView] = {}  # those seen so far, on the device
+        self._on_device: dict[tuple[str, int], TrainingView] = {}  # those seen so far
         self._assigned: dict[str, LabelAssignment] = {}  # of the views seen so far
 
-    def placed(self, view: TrainingView) -> TrainingView:
+    def on_device(self, view: TrainingView) -> TrainingView:
         """The view on the device, where it stays."""
         if self.device.type == "cpu":
             return view
         key = view.name, len(view.photo)
-        if key not in self._placed:
-            self._placed[key] = view.to(self.device)
-        return self._placed[key]
+        if key not in self._on_device:
+            self._on_device[key] = view.to(self.device)
+        return self._on_device[key]
 
     def assigned(self, view: TrainingView) -> LabelAssignment | None:
         """The labels of the view on the device, where they stay; None if it has none."""
@@ -137,10 +158,6 @@ class TrainingState:
         return self._assigned.get(view.name)
 
     # ------------------------------------------------------------------- model
-
-    def rates(self, progress: float) -> dict[str, float | torch.Tensor]:
-        """Learning rates of the Gaussians' tensors at `progress`."""
-        return learning_rates(progress, self.extent, self.gaussians.sh.shape[1], self.config.train.iterations)
 
     def keep(self, rows: torch.Tensor) -> None:
         """Keeps the Gaussians that `rows` [M] int64 selects, with their Adam moments."""
@@ -188,7 +205,7 @@ class TrainingState:
     def load(self, state: dict[str, Any]) -> None:
         """Restores the result of `state`."""
         self.gaussians = Gaussians(**state["optimiser"]["params"]).to(self.device)
-        self.optimiser = SparseAdam(self.gaussians.named(), self.rates(0.0))
+        self.optimiser = SparseAdam(self.gaussians.named())
         self.optimiser.load_state_dict(state["optimiser"])
         self._sync()
         gradient, seen = (state["statistics"][name].to(self.device) for name in ("gradient", "seen"))

@@ -27,7 +27,7 @@ from perception.gaussians.views import TrainingView, target_photo
 from perception.interrupts import uninterrupted
 from perception.machine import torch_on_one_thread
 from perception.rasterizer.rasterize import rasterizer_for
-from perception.rasterizer.types import Cotangents, Forward, Gradients, Inputs, Settings
+from perception.rasterizer.types import Cotangents, Forward, Gradients, Settings
 
 SSIM_WEIGHT = 0.2
 """β of the photometric loss (eq. 4), as in Kerbl et al. 2023."""
@@ -55,31 +55,30 @@ class Trainer(TrainingState):
     def run(self, observer: Observer | None = None, until: float = 1.0) -> TrainRecord:
         """Trains until progress `until`. Early stopping is allowed only with until = 1."""
         self._since = time.monotonic()
-        whole = True  # what a failed step left is no state to resume from
+        intact = True  # what a failed step left is no state to resume from
         try:
             with torch_on_one_thread():
                 while (progress := self.progress) < until:
                     with uninterrupted():
-                        whole = False
-                        self.complete = False
+                        intact = self.complete = False
                         try:
                             loss = self.step(progress)
                         except RuntimeError as error:
                             self._recover(error)
                             continue
                         schedule.after_step(self, progress, may_stop=until >= 1.0)
-                        whole = True
+                        intact = True
                     if observer is not None:
                         observer.after_step(self, loss)
                 if until >= 1.0 and not self.complete:
                     with uninterrupted():
-                        whole = False
+                        intact = False
                         schedule.finish(self)
-                        self.complete = whole = True
+                        self.complete = intact = True
         finally:
             self.record.seconds, self.record.iterations = self.elapsed, self.iteration
             self._since = None
-            if observer is not None and whole:
+            if observer is not None and intact:
                 observer.after_leg(self)
         return self.record
 
@@ -101,7 +100,7 @@ class Trainer(TrainingState):
     def step(self, progress: float) -> float:
         """One iteration: renders a view, computes the loss and its gradient, takes an Adam step. Returns the loss."""
         chosen, with_features = schedule.next_view(self, progress)
-        view = self.placed(chosen)
+        view = self.on_device(chosen)
         height, width = view.photo.shape[:2]
         settings = Settings(
             width,
@@ -114,7 +113,10 @@ class Trainer(TrainingState):
         )
         rasterizer = rasterizer_for(self.device)
         with self.record.timed("rasterizer forward"):
-            inputs = self._inputs(view, with_features)
+            features = self.gaussians.features if with_features else None
+            inputs = self.gaussians.inputs(
+                view.camera_from_world, view.K, features, harmonics=True, background=self._background()
+            )
             out = rasterizer.rasterize_forward(inputs, settings)  # I (eq. 3), F (eq. 5) and Var F (eq. 12)
         with self.record.timed("losses"):
             loss, cotangents = self._losses(view, out)
@@ -131,27 +133,17 @@ class Trainer(TrainingState):
         self.iteration += 1
         return float(loss)
 
-    def _inputs(self, view: TrainingView, with_features: bool) -> Inputs:
-        g = self.gaussians
-        # A random background colour, so that an empty region cannot fit the photo.
-        background = np.random.default_rng([self.config.seed, self.iteration, 1]).random((1, 3), dtype=np.float32)
-        return Inputs(
-            means=g.means,
-            quats=g.quats,
-            scales=g.scales,
-            opacities=g.opacities,
-            colors=g.sh,
-            viewmats=view.camera_from_world[None],
-            Ks=view.K[None],
-            features=g.features if with_features else None,
-            background=torch.from_numpy(background).to(self.device),
-        )
+    def _background(self) -> torch.Tensor:
+        """[1, 3], a random colour, so that an empty region cannot fit the photo."""
+        rng = np.random.default_rng([self.config.seed, self.iteration, 1])
+        return torch.from_numpy(rng.random((1, 3), dtype=np.float32))
 
     def _update(self, progress: float, gradients: Gradients, visible: torch.Tensor) -> None:
         """One step of Adam, for the visible Gaussians."""
-        self.optimiser.rates = self.rates(progress)
-        of_stored = {stored: getattr(gradients, name) for name, stored in STORED.items()}
-        self.record.skipped_gradients += int(sum(self.optimiser.step(visible, of_stored).values()))
+        coefficients = self.gaussians.sh.shape[1]
+        rates = schedule.learning_rates(progress, self.extent, coefficients, self.config.train.iterations)
+        by_name = {stored: getattr(gradients, name) for name, stored in STORED.items()}
+        self.record.skipped_gradients += int(sum(self.optimiser.step(rates, by_name, visible).values()))
 
     def _losses(self, view: TrainingView, out: Forward) -> tuple[float, Cotangents]:
         """L (eq. 14) and its gradients with respect to the images."""
@@ -160,9 +152,9 @@ class Trainer(TrainingState):
         total, colors = rgb.value, view.exposed(rgb.gradient)[None]
         alphas = depths = features = variance = None
         if view.depth is not None and out.depths is not None:
-            value, of_depths, of_alphas = depth_loss(out.depths[0], out.alphas[0], view.depth)
+            value, depths, alphas = depth_loss(out.depths[0], out.alphas[0], view.depth)
             total += losses.depth_weight * value
-            depths, alphas = losses.depth_weight * of_depths[None], losses.depth_weight * of_alphas[None]
+            depths, alphas = losses.depth_weight * depths[None], losses.depth_weight * alphas[None]
         if out.features is not None and out.feature_variance is not None:
             weight = 1.0 if view.weight is None else view.weight[..., None]
             spread = out.feature_variance[0] if view.weight is None else out.feature_variance[0] * weight
@@ -170,6 +162,6 @@ class Trainer(TrainingState):
             total, variance = total + value, (variance if view.weight is None else variance * weight)[None]
             if (labels := self.assigned(view)) is not None:
                 w = INSTANCE_WEIGHT
-                found = instance_loss(out.features[0], labels, margin=losses.margin, w_pos=w, w_neg=w)  # eqs. 6 to 9
-                total, features = total + found.value, found.gradient[None]
+                inst = instance_loss(out.features[0], labels, margin=losses.margin, w_pos=w, w_neg=w)  # eqs. 6 to 9
+                total, features = total + inst.value, inst.gradient[None]
         return total, Cotangents(colors, alphas, depths, features, variance)

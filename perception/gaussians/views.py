@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from perception.gaussians.model import Gaussians
-from perception.gaussians.render import render
 from perception.io.memory import Keep
-from perception.rasterizer.rasterize import Rasterization
+from perception.rasterizer.rasterize import rasterizer_for
+from perception.rasterizer.types import Forward, Settings
 
 _ON_DEVICE = ("photo", "K", "camera_from_world", "weight", "depth", "gain")
 BEST_PSNR = 100.0
@@ -24,7 +24,7 @@ class TrainingView:
     """One photo as used in training. photo [H, W, 3] uint8; labels [H, W] integers (0 = unlabelled) or None;
     K [3, 3] and camera_from_world [4, 4] float32; eps2d: see `rasterize`; weight [H, W] float32: 0 = pixel is ignored,
     None = all pixels count; depth [H, W] float32, what a sensor measured along the optical axis without its edges
-    (`io.depth.without_edges`), in scene units, 0 = none; or None; gain [3] float32: colours of the
+    (`photos.depth.without_edges`), in scene units, 0 = none; or None; gain [3] float32: colours of the
     photo over those of the scene, None = 1. keep: where `stored` puts the images."""
 
     name: str
@@ -40,11 +40,9 @@ class TrainingView:
 
     def stored(self) -> TrainingView:
         """The view with its images where `keep` puts them."""
-        kept: dict[str, Any] = {}
-        for name in ("photo", "labels", "weight", "depth"):
-            if (image := getattr(self, name)) is not None:
-                kept[name] = torch.from_numpy(self.keep(image.numpy()))
-        return replace(self, **kept)
+        images = {name: getattr(self, name) for name in ("photo", "labels", "weight", "depth")}
+        kept = {name: torch.from_numpy(self.keep(image.numpy())) for name, image in images.items() if image is not None}
+        return replace(self, **kept)  # type: ignore[arg-type]
 
     def to(self, device: torch.device) -> TrainingView:
         """The view on `device`, but for the labels, which `losses.assign_labels` reads once."""
@@ -110,6 +108,26 @@ def scene_extent(views: list[TrainingView]) -> float:
     return max(1.1 * float((centres - centres.mean(dim=0)).norm(dim=1).max()), 1e-3)
 
 
+def render(
+    gaussians: Gaussians,
+    camera_from_world: torch.Tensor,
+    K: torch.Tensor,
+    width: int,
+    height: int,
+    *,
+    features: torch.Tensor | None = None,
+    harmonics: bool = False,
+    depth: bool = True,
+    eps2d: float = 0.3,
+) -> Forward:
+    """Renders one view (C = 1) where the Gaussians are, without gradients. First arguments, features and harmonics: see
+    `Gaussians.inputs`; depth and eps2d: see `rasterize`."""
+    degree = gaussians.sh_degree if harmonics else -1
+    settings = Settings(width, height, sh_degree=degree, eps2d=eps2d, variance=False, depth=depth)
+    inputs = gaussians.inputs(camera_from_world, K, features, harmonics=harmonics)
+    return rasterizer_for(gaussians.means.device).rasterize_forward(inputs, settings)
+
+
 @torch.no_grad()
 def render_view(gaussians: Gaussians, view: TrainingView) -> torch.Tensor:
     """The Gaussians rendered and exposed as the view, [H, W, 3] float32 in [0, 1] on the CPU, black background."""
@@ -119,10 +137,10 @@ def render_view(gaussians: Gaussians, view: TrainingView) -> torch.Tensor:
 @torch.no_grad()
 def visible_in(gaussians: Gaussians, view: TrainingView) -> torch.Tensor:
     """[N] bool: whether each Gaussian contributes to some pixel of the view."""
-    return _render(gaussians, view).visible[0]
+    return _render(gaussians, view).visible[0].bool()
 
 
-def _render(gaussians: Gaussians, view: TrainingView) -> Rasterization:
+def _render(gaussians: Gaussians, view: TrainingView) -> Forward:
     height, width = view.photo.shape[:2]
     return render(
         gaussians, view.camera_from_world, view.K, width, height, harmonics=True, depth=False, eps2d=view.eps2d
@@ -134,7 +152,12 @@ def depth_image(
     gaussians: Gaussians, camera_from_world: torch.Tensor, K: torch.Tensor, width: int, height: int
 ) -> torch.Tensor:
     """Expected depth [H, W] on the CPU along the optical axis where the map is more than half opaque, 0 elsewhere."""
-    out = render(gaussians, camera_from_world, K, width, height)
+    return expected_depth(render(gaussians, camera_from_world, K, width, height))
+
+
+def expected_depth(out: Forward) -> torch.Tensor:
+    """`depth_image` of what `render` returned."""
+    assert out.depths is not None  # for the type checker
     alpha = out.alphas[0]
     return torch.where(alpha > 0.5, out.depths[0] / alpha.clamp(min=1e-6), torch.zeros_like(alpha)).cpu()
 

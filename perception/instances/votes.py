@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from scipy import sparse
 
-from perception.gaussians.nearby import Nearby
+from perception.gaussians.model import Nearby
 from perception.gaussians.views import TrainingView
 from perception.io.memory import Keep
 from perception.machine import return_free_memory, torch_on_one_thread

@@ -18,10 +18,8 @@ import torch
 from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.device import choose_device
-from perception.gaussians.model import Gaussians
-from perception.gaussians.nearby import Nearby
-from perception.gaussians.size import sized
-from perception.gaussians.state import TrainRecord
+from perception.gaussians.model import Gaussians, Nearby
+from perception.gaussians.state import TrainRecord, sized
 from perception.gaussians.views import surface_depth
 from perception.geometry import camera_centres
 from perception.machine import memory_limit

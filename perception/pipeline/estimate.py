@@ -11,7 +11,7 @@ from pathlib import Path
 
 from perception.config import MapConfig
 from perception.errors import InputError
-from perception.gaussians.size import sized
+from perception.gaussians.state import sized
 from perception.inputs.load import PhotoSizes, photo_sizes
 from perception.machine import memory_limit
 

@@ -11,8 +11,7 @@ from scipy import sparse
 
 from perception import _core
 from perception.boxes import instance_entry
-from perception.gaussians.model import Gaussians
-from perception.gaussians.nearby import Nearby
+from perception.gaussians.model import Gaussians, Nearby
 from perception.gaussians.views import TrainingView, half_camera
 from perception.instances.crops import choose_views, view_scores
 from perception.instances.describe import describe_instances

@@ -15,11 +15,9 @@ import torch
 
 from perception.config import MapConfig
 from perception.gaussians.depth_start import start_on_surface
-from perception.gaussians.model import Gaussians, from_points
-from perception.gaussians.nearby import Nearby
+from perception.gaussians.model import Gaussians, Nearby, from_points
 from perception.gaussians.photos import load_all, with_labels
-from perception.gaussians.size import sized
-from perception.gaussians.state import TrainRecord
+from perception.gaussians.state import TrainRecord, sized
 from perception.gaussians.train import Trainer
 from perception.gaussians.views import TrainingView, surface_depth
 from perception.io.memory import DiskArrays, Keep

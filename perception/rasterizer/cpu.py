@@ -65,10 +65,10 @@ def rasterize_backward(
     """
     means = inputs.means
     images = _compiled("RasterizerImages", means)(**_arrays(forward, Forward.IMAGES))
-    of_images = _compiled("RasterizerCotangents", means)(**_arrays(cotangents, Forward.IMAGES))
-    of_inputs = _compiled("RasterizerGradients", means)(**_arrays(gradients, Gradients.NAMES))
+    by_image = _compiled("RasterizerCotangents", means)(**_arrays(cotangents, Forward.IMAGES))
+    by_input = _compiled("RasterizerGradients", means)(**_arrays(gradients, Gradients.NAMES))
     run = _compiled("rasterize_backward", means)
-    run(_inputs(inputs, settings), forward.frames, images, of_images, of_inputs, stored)
+    run(_inputs(inputs, settings), forward.frames, images, by_image, by_input, stored)
 
 
 def label_images(inputs: Inputs, labels: np.ndarray, least: float, settings: Settings) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,6 @@ and a tile of 16 × 16 pixels is computed in strips of tile rows. Their gradient
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -16,19 +15,16 @@ import torch
 from torch import Tensor
 
 from perception.errors import InputError
-from perception.rasterizer.cuda.compile import MAX_FEATURES, KernelOptions
-from perception.rasterizer.cuda.launch import THREADS, Kernels, device_kernels
+from perception.rasterizer.cuda.kernels import MAX_FEATURES, THREADS, KernelOptions, Kernels, device_kernels
 from perception.rasterizer.types import Cotangents, Forward, Gradients, Inputs, Settings
 
 _POINTER = ctypes.c_void_p
-KernelsFor = Callable[[KernelOptions, torch.device], Kernels]
 _TILE, _SPLAT, _MOMENTS = 16, 12, 10  # as in device.h: pixels, numbers of a splat, of a record before its features
-_OF_GAUSSIANS = ("means", "quats", "scales", "opacities", "colors", "features")
-_OF_CAMERAS = ("viewmats", "Ks", "background")
+_GAUSSIANS = ("means", "quats", "scales", "opacities", "colors", "features")
+_CAMERAS = ("viewmats", "Ks", "background")
 _MAX_RECORDS = 1 << 24  # with eight feature channels 1.2 GB of records, and 0.4 GB of lists
-_AT_ONCE = 64
-_NO_LABEL = np.iinfo(np.int32).max
-"""Labels whose weights are rendered at once, and a label beyond all others."""
+_AT_ONCE = 64  # labels whose weights are rendered at once
+_NO_LABEL = np.iinfo(np.int32).max  # beyond all labels
 
 
 def _structure(name: str, pointers: str, numbers: str = "", reals: str = "", real: Any = ctypes.c_float) -> Any:
@@ -82,7 +78,6 @@ class Frames:
 
     views: list[list[_Strip]]
     visible: Tensor
-    kernels_for: KernelsFor
     evaluated = contributing = 0  # pairs and seconds are not counted on a device
     seconds: ClassVar[dict[str, float]] = {}
 
@@ -90,8 +85,8 @@ class Frames:
 class _Call:
     """The arguments of one call."""
 
-    def __init__(self, inputs: Inputs, settings: Settings, kernels_for: KernelsFor):
-        self.inputs, self.settings, self._kernels_for = inputs, settings, kernels_for
+    def __init__(self, inputs: Inputs, settings: Settings):
+        self.inputs, self.settings = inputs, settings
         self.means, features = inputs.means, inputs.features
         self.n, self.dims = len(self.means), 0 if features is None else features.shape[1]
         self.blocks = (self.n + THREADS - 1) // THREADS
@@ -103,13 +98,13 @@ class _Call:
         s, width = self.settings, min(self.dims - begin, MAX_FEATURES)
         double = self.means.dtype == torch.float64
         options = KernelOptions(width, s.variance and width > 0, s.depth and begin == 0, double)
-        return self._kernels_for(options, self.means.device)
+        return device_kernels(options, self.means.device)
 
     def scene(self, camera: int, begin: int = 0) -> Any:
         of, s = self.inputs, self.settings
         return _filled(
             SCENES[self.means.dtype],
-            **{name: getattr(of, name) for name in _OF_GAUSSIANS if name != "features"},
+            **{name: getattr(of, name) for name in _GAUSSIANS if name != "features"},
             **{name: getattr(s, name) for name in ("sh_degree", "width", "height", "near_plane", "eps2d")},
             features=None if of.features is None else of.features[:, begin:],
             viewmat=of.viewmats[camera],
@@ -159,7 +154,7 @@ class _Call:
 
     def _refuse(self, index: int) -> None:
         """InputError for Gaussian `index`, or for a camera with -1."""
-        for name in _OF_CAMERAS if index < 0 else _OF_GAUSSIANS:
+        for name in _CAMERAS if index < 0 else _GAUSSIANS:
             tensor = getattr(self.inputs, name)
             if tensor is None:
                 continue
@@ -182,10 +177,10 @@ def _images(structure: Any, of: Forward | Cotangents, camera: int, begin: int, *
     return _filled(structure, **own | more)
 
 
-def rasterize_forward(inputs: Inputs, settings: Settings, kernels_for: KernelsFor = device_kernels) -> Forward:
+def rasterize_forward(inputs: Inputs, settings: Settings) -> Forward:
     """As `rasterizer.cpu.rasterize_forward`, on the tensors' device."""
-    call, out = _Call(inputs, settings, kernels_for), Forward.empty(inputs, settings)
-    out.frames = Frames([call.project(c, radii) for c, radii in enumerate(out.radii)], out.visible, kernels_for)
+    call, out = _Call(inputs, settings), Forward.empty(inputs, settings)
+    out.frames = Frames([call.project(c, radii) for c, radii in enumerate(out.radii)], out.visible)
     for camera, strips in enumerate(out.frames.views):
         for begin in call.slices:
             kernels, scene = call.kernels(begin), call.scene(camera, begin)
@@ -203,15 +198,15 @@ def rasterize_backward(
     gradients: Gradients,
     stored: bool = False,
 ) -> None:
-    """As `rasterizer.cpu.rasterize_backward`, on the tensors' device; with `stored`, `gradients` are written whole."""
+    """As `rasterizer.cpu.rasterize_backward`, on the tensors' device; with `stored`, all rows are written."""
     frames: Frames = forward.frames
-    call, count = _Call(inputs, settings, frames.kernels_for), len(frames.views)
-    given = {name: getattr(gradients, name) for name in Gradients.NAMES}
+    call, count = _Call(inputs, settings), len(frames.views)
+    outputs = {name: getattr(gradients, name) for name in Gradients.NAMES}
     if stored:
-        for gradient in given.values():
+        for gradient in outputs.values():
             if gradient is not None:
                 gradient.zero_()
-    features, viewmats, mean2d = (given.pop(name) for name in ("features", "viewmats", "mean2d"))
+    features, viewmats, mean2d = (outputs.pop(name) for name in ("features", "viewmats", "mean2d"))
     cameras = None if viewmats is None else call.means.new_zeros((count, call.n, 12))
     if forward.features is None and call.dims:  # rendered without features, which are zeros, wanted for their gradient
         forward = replace(forward, features=call.means.new_zeros((*forward.alphas.shape, call.dims)))
@@ -223,7 +218,7 @@ def rasterize_backward(
             cotangent = _images(COTANGENTS, cotangents, camera, begin)
             added = _filled(
                 GRADIENTS,
-                **given,
+                **outputs,
                 features=None if features is None else features[:, begin:],
                 camera=None if cameras is None else cameras[camera],
                 mean2d=None if mean2d is None else mean2d[camera],
@@ -253,11 +248,11 @@ def label_images(inputs: Inputs, labels: np.ndarray, least: float, settings: Set
     images = []
     for row in labels:
         names = torch.from_numpy(np.unique(row[visible & (row >= 0)])).to(viewmats.device)
-        of = torch.from_numpy(np.ascontiguousarray(row)).to(viewmats.device)
+        label_of = torch.from_numpy(np.ascontiguousarray(row)).to(viewmats.device)
         best = viewmats.new_full((settings.height, settings.width), least)
         image = torch.full_like(best, -1, dtype=torch.int32)
         for some in names.split(_AT_ONCE) if len(names) else ():
-            features = (of[:, None] == some).to(best.dtype)
+            features = (label_of[:, None] == some).to(best.dtype)
             weights = rasterize_forward(replace(inputs, features=features, background=None), settings).features
             assert weights is not None  # for the type checker
             most = weights[0].amax(dim=2)

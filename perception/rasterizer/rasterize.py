@@ -1,8 +1,10 @@
 """Differentiable rasterization of 3D Gaussians.
 
-Follows the 3DGS equations: 2D covariance J R Σ Rᵀ Jᵀ + 0.3 px² I, alpha = min(0.999, o·exp(−½ dᵀ Σ⁻¹ d)),
-contributions under 1/255 skipped, front to back by depth (equal depths by index), stop before the
-transmittance falls under 1e-4. rasterizer/cpu.py computes both passes on the CPU, rasterizer/device.py on a GPU.
+Follows the 3DGS equations: 2D covariance Σ' = J R Σ Rᵀ Jᵀ + 0.3 px² I, alpha = min(0.999, o·exp(−½ dᵀ Σ'⁻¹ d)), weight
+w = alpha · T. Σ: covariance of the Gaussian in the world, R: rotation of the camera, J: derivative of the projection,
+o: opacity, d: pixel minus projected mean, T: transmittance, the product of 1 − alpha over the Gaussians in front.
+Contributions under 1/255 are skipped, front to back by depth (equal depths by index), stop before T falls under 1e-4.
+rasterizer/cpu.py computes both passes on the CPU, rasterizer/device.py on a GPU.
 """
 
 from __future__ import annotations
@@ -90,19 +92,18 @@ class _Rasterize(torch.autograd.Function):
         images = dict(zip(Forward.IMAGES, saved[len(Inputs.NAMES) :], strict=True))
         none = inputs.means.new_empty(0)
         state = Forward(**images, visible=none, radii=none, frames=ctx.frames)
-        given = [None if g is None else g.contiguous() for g in cotangents[: len(Forward.IMAGES)]]
-        of_images = Cotangents(**dict(zip(Forward.IMAGES, given, strict=True)))
-        wanted = {name for name, is_wanted in zip(Inputs.NAMES, ctx.needs_input_grad[2:], strict=True) if is_wanted}
-        of_inputs = wanted - {"background", "Ks"}
-        gradients = Gradients.zeros(inputs, of_inputs if of_inputs == {"features"} else of_inputs | {"mean2d"})
-        rasterizer_for(inputs.means.device).rasterize_backward(inputs, ctx.settings, state, of_images, gradients)
+        contiguous = [None if g is None else g.contiguous() for g in cotangents[: len(Forward.IMAGES)]]
+        by_image = Cotangents(**dict(zip(Forward.IMAGES, contiguous, strict=True)))
+        needed = {name for name, needs in zip(Inputs.NAMES, ctx.needs_input_grad[2:], strict=True) if needs}
+        wanted = needed - {"background", "Ks"}
+        gradients = Gradients.zeros(inputs, wanted if wanted == {"features"} else wanted | {"mean2d"})
+        rasterizer_for(inputs.means.device).rasterize_backward(inputs, ctx.settings, state, by_image, gradients)
         ctx.stats.mean2d_grad = None if gradients.mean2d is None else gradients.mean2d.norm(dim=-1)
         ctx.stats.seconds = ctx.frames.seconds
-        shade = None
-        if "background" in wanted and of_images.colors is not None:
-            shade = (of_images.colors * (1 - state.alphas)[..., None]).sum(dim=(1, 2))
-        found = {name: getattr(gradients, name) for name in of_inputs} | {"background": shade}
-        return (None, None, *(found.get(name) for name in Inputs.NAMES))
+        by_input = {name: getattr(gradients, name) for name in wanted}
+        if "background" in needed and by_image.colors is not None:
+            by_input["background"] = (by_image.colors * (1 - state.alphas)[..., None]).sum(dim=(1, 2))
+        return (None, None, *(by_input.get(name) for name in Inputs.NAMES))
 
 
 def rasterize(
@@ -180,8 +181,8 @@ def _check(
         if not isinstance(t, torch.Tensor):
             raise InputError(f"rasterize: {name} is {type(t).__name__}, expected a torch.Tensor")
         if t.device.type not in _DEVICES or (means is not None and t.device != means.device):
-            place = "cpu or cuda" if means is None or t is means else f"{means.device}, where means are"
-            raise InputError(f"rasterize: {name} is on {t.device}, expected {place}")
+            expected = "cpu or cuda" if means is None or t is means else f"{means.device}, where means are"
+            raise InputError(f"rasterize: {name} is on {t.device}, expected {expected}")
         if t.dtype not in (torch.float32, torch.float64) or (means is not None and t.dtype != means.dtype):
             wanted = "float32 or float64" if means is None or t is means else means.dtype
             raise InputError(f"rasterize: {name} is {t.dtype}, expected {wanted}")

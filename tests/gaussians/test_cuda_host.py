@@ -13,9 +13,8 @@ import torch
 import perception
 from perception.rasterizer import cpu
 from perception.rasterizer import device as on_device
-from perception.rasterizer.cuda import compile as compiling
-from perception.rasterizer.cuda import launch
-from perception.rasterizer.cuda.compile import KernelOptions, compile_kernels, nvrtc_version
+from perception.rasterizer.cuda import kernels as cuda
+from perception.rasterizer.cuda.kernels import KernelOptions, compile_kernels, nvrtc_version
 from perception.rasterizer.rasterize import rasterizer_for
 from perception.rasterizer.types import Settings
 from support.cuda_emulator import build
@@ -28,7 +27,7 @@ KERNELS = {"project_kernel", "count_kernel", "emit_kernel", "forward_kernel", "b
 @pytest.fixture
 def nvrtc() -> ctypes.CDLL:
     try:
-        return compiling.load_nvrtc()
+        return cuda.load_nvrtc()
     except perception.InputError as error:
         pytest.skip(str(error))
 
@@ -49,7 +48,7 @@ def test_nvrtc_compiles_every_architecture_with_hardly_a_spill(nvrtc, architectu
 def test_nvrtc_reports_what_it_refuses(nvrtc, monkeypatch):
     with pytest.raises(RuntimeError, match=r"do not compile for sm_12: "):
         compile_kernels(nvrtc, OPTIONS, 12)
-    monkeypatch.setattr(compiling, "sources", lambda: {"kernels.cu": "int main( {"})
+    monkeypatch.setattr(cuda, "sources", lambda: {"kernels.cu": "int main( {"})
     with pytest.raises(RuntimeError, match=r"kernels.cu\(1\): error"):
         compile_kernels(nvrtc, OPTIONS, 89)
 
@@ -58,14 +57,14 @@ def test_without_nvrtc_the_package_to_install_is_named(monkeypatch):
     def nothing(name):
         raise OSError(name)
 
-    monkeypatch.setattr(compiling.sys, "path", [])
-    monkeypatch.setattr(compiling.ctypes, "CDLL", nothing)
+    monkeypatch.setattr(cuda.sys, "path", [])
+    monkeypatch.setattr(cuda.ctypes, "CDLL", nothing)
     monkeypatch.setattr(torch.version, "cuda", "12.8")
     with pytest.raises(perception.InputError, match="pip install nvidia-cuda-nvrtc-cu12"):
-        compiling.load_nvrtc.__wrapped__()
-    monkeypatch.setattr(launch.ctypes, "CDLL", nothing)
+        cuda.load_nvrtc.__wrapped__()
+    monkeypatch.setattr(cuda.ctypes, "CDLL", nothing)
     with pytest.raises(perception.InputError, match=r"no NVIDIA driver was found \(libcuda.so.1\)"):
-        launch.load_driver.__wrapped__()
+        cuda.load_driver.__wrapped__()
 
 
 def test_machine_code_is_compiled_once_for_each_source_option_and_architecture(tmp_path, monkeypatch):
@@ -77,48 +76,49 @@ def test_machine_code_is_compiled_once_for_each_source_option_and_architecture(t
 
     texts = {"kernels.cu": "a"}
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(compiling, "load_nvrtc", lambda: None)
-    monkeypatch.setattr(compiling, "nvrtc_version", lambda _: (12, 9))
-    monkeypatch.setattr(compiling, "compile_kernels", compile_once)
-    monkeypatch.setattr(compiling, "sources", lambda: texts)
-    first = compiling.cached_kernels(OPTIONS, 89)
-    assert compiling.cached_kernels(KernelOptions(8, True, True), 89) == first == b"cubin 1"
+    monkeypatch.setattr(cuda, "load_nvrtc", lambda: None)
+    monkeypatch.setattr(cuda, "nvrtc_version", lambda _: (12, 9))
+    monkeypatch.setattr(cuda, "compile_kernels", compile_once)
+    monkeypatch.setattr(cuda, "sources", lambda: texts)
+    first = cuda.cached_kernels(OPTIONS, 89)
+    assert cuda.cached_kernels(KernelOptions(8, True, True), 89) == first == b"cubin 1"
     for options, architecture in ((OPTIONS, 90), (KernelOptions(5, True, True), 89)):
-        assert compiling.cached_kernels(options, architecture) != first
+        assert cuda.cached_kernels(options, architecture) != first
     texts["kernels.cu"] = "b"
-    assert compiling.cached_kernels(OPTIONS, 89) == b"cubin 4"
+    assert cuda.cached_kernels(OPTIONS, 89) == b"cubin 4"
     assert len(list((tmp_path / "perception" / "cuda").iterdir())) == 4
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))  # a folder that cannot be made
-    assert compiling.cached_kernels(OPTIONS, 89) == b"cubin 5"
+    assert cuda.cached_kernels(OPTIONS, 89) == b"cubin 5"
 
 
-def test_a_real_cubin_goes_through_the_driver_path(nvrtc):
+def test_a_real_cubin_goes_through_the_driver_path(nvrtc, monkeypatch):
     cubin, _ = compile_kernels(nvrtc, OPTIONS, 89)
-    kernels = launch.Kernels(build(KernelOptions(5, True, True, double=True), None), cubin, lambda: nullcontext(0))
+    kernels = cuda.Kernels(build(KernelOptions(5, True, True, double=True), None), cubin, lambda: nullcontext(0))
     inputs = scene(n=50)
     arguments = passed(inputs), Settings(inputs["width"], inputs["height"])
-    found = on_device.rasterize_forward(*arguments, lambda *_: kernels)
+    monkeypatch.setattr(on_device, "device_kernels", lambda *_: kernels)
+    found = on_device.rasterize_forward(*arguments)
     torch.testing.assert_close(found.colors, cpu.rasterize_forward(*arguments).colors, rtol=1e-12, atol=1e-12)
 
 
 def test_the_drivers_errors_are_told():
     driver = build(KernelOptions(5, True, True, double=True), None)
     with pytest.raises(RuntimeError, match="CUDA error 200 in loading the kernels: device kernel image is invalid"):
-        launch.Kernels(driver, b"PTX", lambda: nullcontext(0))
+        cuda.Kernels(driver, b"PTX", lambda: nullcontext(0))
     with pytest.raises(RuntimeError, match="CUDA error 500 in looking up no_kernel: not found"):
-        launch.Kernels(driver, b"\x7fELF", lambda: nullcontext(0)).launch("no_kernel", 1)
+        cuda.Kernels(driver, b"\x7fELF", lambda: nullcontext(0)).launch("no_kernel", 1)
 
 
 def test_what_a_device_cannot_do_is_refused(monkeypatch):
-    cuda = torch.device("cuda", 0)
-    assert rasterizer_for(cuda) is on_device and rasterizer_for(torch.device("cpu")) is cpu
+    gpu = torch.device("cuda", 0)
+    assert rasterizer_for(gpu) is on_device and rasterizer_for(torch.device("cpu")) is cpu
     with pytest.raises(perception.InputError, match="the tensors are float64, expected float32 on a CUDA device"):
-        launch.device_kernels(KernelOptions(8, True, True, double=True), cuda)
+        cuda.device_kernels(KernelOptions(8, True, True, double=True), gpu)
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _: (6, 1))
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "GTX 1080")
     with pytest.raises(perception.InputError, match=r"GTX 1080 has compute capability 6.1, expected 7.5 or more"):
-        launch.device_kernels(OPTIONS, cuda)
+        cuda.device_kernels(OPTIONS, gpu)
     inputs = scene()
     with pytest.raises(perception.InputError, match="quats is on meta, expected cpu, where means are"):
         perception.rasterize(**{**inputs, "quats": inputs["quats"].to("meta")})

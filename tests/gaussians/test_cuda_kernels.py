@@ -10,7 +10,7 @@ import torch
 import perception
 from perception.rasterizer import cpu
 from perception.rasterizer import device as on_device
-from perception.rasterizer.cuda.compile import KernelOptions
+from perception.rasterizer.cuda.kernels import KernelOptions
 from perception.rasterizer.types import Cotangents, Gradients, Settings
 from support.cuda_emulator import REVERSED, build, emulate, emulated, find_compiler, on_emulator, wide_scene, worst
 from support.hard_scenes import SCENES
@@ -77,13 +77,14 @@ def test_the_float_build_follows_the_double_build():
         assert error <= 3 * cpu_error + 1e-5  # flips at the 1/255 threshold are in both
 
 
-def test_memory_is_bounded_by_strips():
+def test_memory_is_bounded_by_strips(monkeypatch):
+    monkeypatch.setattr(on_device, "device_kernels", emulated())
     inputs = wide_scene()
     settings = [Settings(200, 150, max_records=limit) for limit in (0, 1, 600)]
     given = passed(inputs)
     results = []
     for setting in settings:
-        out = on_device.rasterize_forward(given, setting, emulated())
+        out = on_device.rasterize_forward(given, setting)
         cotangents = Cotangents(torch.sin(out.colors * 40), out.alphas, out.depths, torch.cos(out.features * 30))
         gradients = Gradients.zeros(given, EVERY_GRADIENT)
         on_device.rasterize_backward(given, setting, out, cotangents, gradients)

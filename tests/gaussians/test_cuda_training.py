@@ -15,8 +15,7 @@ from perception.errors import InputError
 from perception.gaussians import device as devices
 from perception.gaussians import schedule
 from perception.gaussians.losses import assign_labels, instance_loss
-from perception.gaussians.model import from_points
-from perception.gaussians.nearby import Nearby
+from perception.gaussians.model import Nearby, from_points
 from perception.gaussians.train import Trainer
 from perception.gaussians.views import TrainingView, surface_depth
 from perception.instances.votes import mask_votes
@@ -57,13 +56,13 @@ def test_instance_loss_and_gradient(labels, monkeypatch):
     features = 5 + 0.3 * random(31, 70, 4)  # more than one piece of pixels, and far from 0
     image = (random(31, 70, seed=3) * (labels + 1)).int()
     assigned = assign_labels(image)
-    expected = instance_loss(features, assigned, w_pos=0.3, w_neg=0.7)
+    expected = instance_loss(features, assigned, margin=1.0, w_pos=0.3, w_neg=0.7)
     monkeypatch.setattr("perception.gaussians.losses.training_kernels", lambda _: training)
-    found = instance_loss(features, assigned, w_pos=0.3, w_neg=0.7)
+    found = instance_loss(features, assigned, margin=1.0, w_pos=0.3, w_neg=0.7)
     for name in ("value", "pos", "neg", "gradient", "prototypes"):
         a, b = (torch.as_tensor(getattr(of, name), dtype=torch.float64) for of in (found, expected))
         torch.testing.assert_close(a, b, **CLOSE)
-    assert len(expected.labels) == labels
+    assert len(expected.prototypes) == labels
 
 
 def test_sums_and_scaled_values():
@@ -134,8 +133,7 @@ def trainer(device: torch.device | None, *more: str) -> Trainer:
 @pytest.fixture
 def pretended(monkeypatch):
     """The pretended device, with the emulator as its rasterizer."""
-    forward = on_device.rasterize_forward
-    monkeypatch.setattr(on_device, "rasterize_forward", lambda *given: forward(*given, emulated()))
+    monkeypatch.setattr(on_device, "device_kernels", emulated())
     monkeypatch.setattr(public, "_DEVICES", ("cpu", pretend_device.NAME))
     with pretended_device() as device:
         yield device

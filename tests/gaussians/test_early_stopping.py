@@ -18,11 +18,10 @@ import torch
 
 from perception.cli import _resume, main
 from perception.config import PAPER, load_config
-from perception.gaussians import schedule
+from perception.gaussians import optimiser, schedule
 from perception.gaussians.early_stopping import COST_EXPONENT, EarlyStopping
 from perception.gaussians.model import from_points
-from perception.gaussians.optimiser import SparseAdam
-from perception.gaussians.rates import cooling, learning_rates
+from perception.gaussians.schedule import cooling, learning_rates
 from perception.gaussians.train import Trainer
 from perception.gaussians.views import TrainingView
 from perception.io.cloud import read_cloud, write_cloud
@@ -89,9 +88,8 @@ def test_shorter_runs_have_higher_rates_of_means_and_rotations() -> None:
 
 
 def test_rates_cool_down_over_the_last_share_only() -> None:
-    values = [cooling(p, 0.2) for p in np.linspace(0, 1, 101)]
-    assert values[:81] == [1.0] * 81 and np.all(np.diff(values[80:]) < 0) and values[-1] == pytest.approx(0.05)
-    assert cooling(1.0, 0.0) == 1.0
+    values = [cooling(p) for p in np.linspace(0, 1, 101)]
+    assert values[:91] == [1.0] * 91 and np.all(np.diff(values[90:]) < 0) and values[-1] == pytest.approx(0.05)
 
 
 SMALL = ["train.budget=3000", "densify.every=20", "language.encoder=none", "photos.holdout=6"]
@@ -229,14 +227,15 @@ def test_only_whole_steps_are_kept(monkeypatch: pytest.MonkeyPatch, how: str) ->
     words = ("train.iterations=6", "train.exchange_db=0")
     undisturbed, trainer, resumed = (small_trainer(*words) for _ in range(3))
     undisturbed.run()
-    step_one, saved = SparseAdam._step_one, []
+    kernels, calls, saved = optimiser.training_kernels, [], []
 
-    def disturbed(self: SparseAdam, name: str, *rest: Any) -> tuple[int, int]:
-        if trainer.iteration == 2 and name == list(self.params)[1]:
+    def disturbed(device: torch.device) -> Any:
+        calls.extend([device] if trainer.iteration == 2 else [])
+        if len(calls) == 2:
             if how == "failure":
                 raise MemoryError
             signal.raise_signal(signal.SIGINT)
-        return step_one(self, name, *rest)
+        return kernels(device)
 
     class Saver:
         def after_step(self, trainer: Trainer, loss: float) -> None: ...
@@ -247,7 +246,7 @@ def test_only_whole_steps_are_kept(monkeypatch: pytest.MonkeyPatch, how: str) ->
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores SIGINT
     try:
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt if how == "interrupt" else MemoryError):
-            patch.setattr(SparseAdam, "_step_one", disturbed)
+            patch.setattr(optimiser, "training_kernels", disturbed)
             trainer.run(Saver())
     finally:
         signal.signal(signal.SIGINT, before)

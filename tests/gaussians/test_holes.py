@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from perception.gaussians.holes import fill_holes
+from perception.gaussians.densify import fill_holes
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.views import TrainingView, render_view, visible_in
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from perception.config import load_config
-from perception.gaussians.size import sized
+from perception.gaussians.state import sized
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,7 @@ from sklearn.metrics import adjusted_rand_score
 
 pytest.importorskip("perception._core")
 from perception.config import InstanceConfig
-from perception.gaussians.model import from_points
-from perception.gaussians.nearby import Nearby
+from perception.gaussians.model import Nearby, from_points
 from perception.gaussians.views import TrainingView
 from perception.instances.group import Grouping, group
 from perception.instances.votes import beside, mask_votes

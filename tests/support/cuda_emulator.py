@@ -19,8 +19,7 @@ import torch
 
 from perception.rasterizer import cpu
 from perception.rasterizer import device as on_device
-from perception.rasterizer.cuda.compile import KernelOptions
-from perception.rasterizer.cuda.launch import Kernels
+from perception.rasterizer.cuda.kernels import KernelOptions, Kernels
 from support.rasterizer import grads_and_images, scene
 
 CSRC = Path(__file__).resolve().parents[2] / "csrc"
@@ -98,13 +97,11 @@ def emulated(lanes: int = IN_ORDER, edit: tuple[str, str] | None = None) -> Kern
 @contextmanager
 def on_emulator(kernels_for: KernelsFor) -> Iterator[None]:
     """Within it `perception.rasterize` runs the CUDA kernels."""
-    forward, backward = cpu.rasterize_forward, cpu.rasterize_backward
-    cpu.rasterize_forward = lambda *given: on_device.rasterize_forward(*given, kernels_for)
-    cpu.rasterize_backward = on_device.rasterize_backward
-    try:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(on_device, "device_kernels", kernels_for)
+        patch.setattr(cpu, "rasterize_forward", on_device.rasterize_forward)
+        patch.setattr(cpu, "rasterize_backward", on_device.rasterize_backward)
         yield
-    finally:
-        cpu.rasterize_forward, cpu.rasterize_backward = forward, backward
 
 
 def emulate(inputs, lanes=IN_ORDER, edit=None, **options):

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from perception.gaussians.model import Gaussians, from_points
-from perception.gaussians.render import render
+from perception.gaussians.views import render
 from perception.instances.silhouettes import render_silhouettes
 from perception.io.cloud import write_cloud
 from perception.types import PointCloud

@@ -172,7 +172,7 @@ class InstanceViews:
         """Accumulated rendering weight [H, W] float32 in [0, 1] of the instances' Gaussians, or the bool mask."""
         import torch
 
-        from perception.gaussians.render import render
+        from perception.gaussians.views import render
 
         own = torch.from_numpy(np.isin(self.gmap.instance_ids, instances))
         if not own.any():

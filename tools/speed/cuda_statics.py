@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import struct
 
-from perception.rasterizer.cuda.compile import KernelOptions, compile_kernels, load_nvrtc, nvrtc_version
+from perception.rasterizer.cuda.kernels import KernelOptions, compile_kernels, load_nvrtc, nvrtc_version
 
 ARCHITECTURES = (75, 80, 86, 89, 90, 100, 120)
 BYTES = 16

@@ -1,5 +1,1 @@
-"""What runs on CUDA devices: the rasterizer's kernels (csrc/cuda), compiled at run time by NVRTC and launched, and the
-losses and Adam. See docs/cuda.md.
-
-No GPU has run it yet: the kernels are tested on the CPU, by an emulator of thread blocks.
-"""
+"""The rasterizer's kernels (csrc/cuda) compiled and launched, the losses and Adam on CUDA devices. See docs/cuda.md."""

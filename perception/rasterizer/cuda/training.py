@@ -19,7 +19,12 @@ _PIECE = 1024
 def photometric(
     render: Tensor, target: Tensor, weight: Tensor | None, gradient: Tensor, beta: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """(loss, l1, ssim) of images [H, W, C] and d loss / d render into gradient. Derivation: kernels/photometric.h."""
+    """(loss, l1, ssim) of images [H, W, C] and d loss / d render into gradient. Derivation: kernels/photometric.h.
+
+    With E[·] the mean under the window: mx = E[x], my = E[y], square = E[x² + y²], product = E[x y],
+    ssim = a1 a2 / (b1 b2), a1 = 2 mx my + C1, a2 = 2 (product − mx my) + C2, b1 = mx² + my² + C1,
+    b2 = square − mx² − my² + C2. share: weight of an element of the image in the mean. by_…: d ssim / d each mean.
+    """
     x, y = render, target.to(render.dtype) / 255 if target.dtype == torch.uint8 else target
     weight = torch.ones_like(x[..., 0]) if weight is None else weight
     share = weight[..., None] / (weight.double().sum() * x.shape[2]).clamp(min=1e-30).to(x.dtype)
@@ -34,9 +39,9 @@ def photometric(
     b2 = square + _C1 + _C2 - b1
     below = 1 / (b1 * b2)
     ssim = a1 * a2 * below
-    of_mean = 2 * (my * (a2 - a1) * below - mx * ssim * (1 / b1 - 1 / b2))
-    of_mean, of_square, of_product = _blurred(share * of_mean, -share * ssim / b2, 2 * share * a1 * below)
-    gradient.add_(of_mean + 2 * x * of_square + y * of_product, alpha=-beta)
+    by_mean = 2 * (my * (a2 - a1) * below - mx * ssim * (1 / b1 - 1 / b2))
+    by_mean, by_square, by_product = _blurred(share * by_mean, -share * ssim / b2, 2 * share * a1 * below)
+    gradient.add_(by_mean + 2 * x * by_square + y * by_product, alpha=-beta)
     mean = (ssim * share).double().sum()
     return (1 - beta) * l1 + beta * ((1 - ssim) * share).double().sum(), l1, mean
 
@@ -89,7 +94,7 @@ def spread(features: Tensor, slots: Tensor, means: Tensor, pull: Tensor, push: T
         out.zero_()
         return
     index = slots.long().clamp(min=0)
-    pull, push, means = (of.to(features.dtype)[index] for of in (pull, push, means))
+    pull, push, means = (table.to(features.dtype)[index] for table in (pull, push, means))
     out.copy_(torch.where(slots[:, None] >= 0, pull[:, None] * (features - means) + push, 0.0))
 
 
