@@ -157,7 +157,7 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.export.transfer import ExportOptions
     from perception.io.outputs import check_side_file, refuse_inputs
     from perception.map.write import read_map
-    from perception.query.query_map import load_map
+    from perception.query import load_map
     from perception.query.scene_graph import write_graph
 
     if args.output is None and args.mesh is None and args.voxels is None and args.graph is None:

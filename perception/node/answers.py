@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from perception.colors import instance_palette, rgb8_from_sh
 from perception.query import Hit, QueryMap
-from perception.query.requests import Reply
+from perception.serve.requests import Reply
 from perception.types import OrientedBox
 
 

@@ -19,9 +19,9 @@ from perception.errors import InputError
 from perception.node import answers
 from perception.node.config import NodeConfig
 from perception.query import QueryMap
-from perception.query.requests import MAX_BYTES, EngineBusy, EngineClosed, Reply, Request, error_kind, error_line
 from perception.serve.bodies import QueryBody, parse
 from perception.serve.engine import QueryEngine
+from perception.serve.requests import MAX_BYTES, EngineBusy, EngineClosed, Reply, Request, error_kind, error_line
 
 _SHOWN = 80
 

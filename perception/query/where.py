@@ -55,7 +55,7 @@ class Where:
         if self.region is not None:
             object.__setattr__(self, "region", check_box(self.region))
         if self.near is not None:
-            object.__setattr__(self, "near", place(self.near))
+            object.__setattr__(self, "near", position_of(self.near))
         if self.labels is not None:
             names = [self.labels] if isinstance(self.labels, str) else list(self.labels)
             if not all(isinstance(name, str) for name in names):
@@ -89,7 +89,7 @@ class Where:
         )
 
 
-def place(point_or_pose: Any) -> np.ndarray:
+def position_of(point_or_pose: Any) -> np.ndarray:
     """[3] float64: a point as it is, or the origin of a pose [4, 4] (map_from_robot); InputError for other input."""
     array = numbers(point_or_pose, "near", "a point [3] or a pose [4, 4]")
     if array.shape == (4, 4):

@@ -15,12 +15,11 @@ from starlette.concurrency import run_in_threadpool
 from perception import __version__
 from perception.io.ply import ply_bytes
 from perception.query.query_map import QueryMap
-from perception.query.requests import source
 from perception.query.where import Frame
 from perception.serve.bodies import AtBody, FindBody, NearestBody, QueryBody
 from perception.serve.engine import QueryEngine
-from perception.serve.guard import HANDLERS, Guard
-from perception.serve.server import ServeSettings
+from perception.serve.guard import HANDLERS, HttpGuard
+from perception.serve.requests import ServeSettings, source
 
 FORMATS = {"npz": "application/x-npz", "ply": "application/octet-stream"}
 """Name → media type."""
@@ -58,7 +57,7 @@ T = TypeVar("T")
 MapId = Annotated[str | None, Query(description="answer only from this very map, else 409")]
 Id = Annotated[int, Path(alias="id", ge=0, lt=10**9)]
 _ABOUT = (
-    "Text prompts and places in, 3D instances of a map out. Lengths are in the unit of the map's frame, metres when "
+    "Text prompts and positions in, 3D instances of a map out. Lengths are in the unit of the map's frame, metres when "
     "`metric`. With `frame`, everything in a request and its answer is in that frame. An error is one JSON object, "
     '{"error": line, "status": code}. Points are bytes; the header X-Map-Id names their map.'
 )
@@ -75,7 +74,7 @@ def build_app(engine: QueryEngine, settings: ServeSettings) -> FastAPI:
         redirect_slashes=False,
         exception_handlers=HANDLERS,
     )
-    app.add_middleware(Guard, settings=settings)
+    app.add_middleware(HttpGuard, settings=settings)
     routes = _Routes(engine)
     app.get("/health")(routes.health)
     app.post("/query")(routes.query)

@@ -13,8 +13,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError
 
 from perception.errors import InputError
-from perception.query.requests import MAX_TEXT, MAX_TEXTS, MAX_TOP, TOP, Request
+from perception.query.requests import MAX_TEXT, MAX_TOP, TOP
 from perception.query.where import Frame, Where, axis_box
+from perception.serve.requests import MAX_TEXTS, Request
 from perception.types import OrientedBox
 
 MAX_NUMBER = 1e12

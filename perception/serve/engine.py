@@ -26,8 +26,8 @@ from perception.errors import InputError
 from perception.language.base import Encoder
 from perception.language.encoders import make_encoder
 from perception.map.files import map_signature
-from perception.query.query_map import QueryMap, load_map
-from perception.query.requests import (
+from perception.query import QueryMap, load_map
+from perception.serve.requests import (
     AnswerTimeout,
     EngineBusy,
     EngineClosed,

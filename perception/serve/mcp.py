@@ -26,12 +26,13 @@ from perception.geometry import scale_of
 from perception.query import Frame, Hit, QueryMap, Where
 from perception.query.crops import OUTSIDE, PhotoOutside, best_crop, photos_outside
 from perception.query.hit import printed_texts
-from perception.query.requests import MAX_TOP, NoScale, UnknownFrame, error_kind, error_line, source
+from perception.query.requests import MAX_TOP
+from perception.query.robot_pose import where_to_stand
 from perception.query.scene_graph import scene_graph
-from perception.query.standing import where_to_stand
 from perception.serve.bodies import AnyRegion, Body, FrameBody, Length, Place, Prompt, Text, parse
 from perception.serve.engine import QueryEngine
-from perception.serve.server import ServeSettings, serve
+from perception.serve.requests import NoScale, ServeSettings, UnknownFrame, error_kind, error_line, source
+from perception.serve.server import serve
 
 try:
     from mcp import MCPError, types
@@ -327,12 +328,12 @@ def serve_http(path: Path, settings: ServeSettings, encoders: Any = None, photos
 
     No session is kept: each request is answered by itself, so a client may vanish at any time.
     """
-    from perception.serve.guard import Guard
+    from perception.serve.guard import HttpGuard
 
     def build(engine: QueryEngine, settings: ServeSettings) -> Any:
         server, host = make_server(engine, photos), settings.host
         app = server.streamable_http_app(stateless_http=True, max_request_body_size=settings.max_body, host=host)
-        app.add_middleware(Guard, settings=settings)
+        app.add_middleware(HttpGuard, settings=settings)
         return app
 
     serve(path, settings, encoders, build, "/mcp")

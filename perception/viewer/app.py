@@ -17,8 +17,8 @@ import numpy as np
 
 from perception.colors import instance_palette
 from perception.errors import InputError, missing_extra
-from perception.serve.listening import check_address, listen, url_host
-from perception.viewer.guard import Guard, guarded_server
+from perception.serve.listening import Guard, check_address, listen, url_host
+from perception.viewer.handshake import guarded_server
 from perception.viewer.levels import MOST, Level, level
 from perception.viewer.panel import Panel
 from perception.viewer.picking import covariances
@@ -56,7 +56,7 @@ class Viewer:
             sock = undo.enter_context(listen(host, port))
             self.session = Session(path, photos)
             label = f"perception · {path.name}"
-            self.server = guarded_server(Guard(token, host), sock, host=host, port=port, label=label, verbose=False)
+            self.server = guarded_server(Guard(host, token), sock, host=host, port=port, label=label, verbose=False)
             undo.pop_all()  # the server owns the socket from here on
         shown = "localhost" if host in ("127.0.0.1", "0.0.0.0", "::") else url_host(host)
         self.address = f"http://{shown}:{sock.getsockname()[1]}"

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import string
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from perception.query.hit import printed_texts
 from perception.report.text import frame_lines
-from perception.viewer.session import MODES
-
-if TYPE_CHECKING:
-    from perception.viewer.app import Viewer
+from perception.viewer.session import MODES, Session
 
 _OF_ADDRESSES = {f"&#{ord(c)};" for c in ".:@"}
 
@@ -26,10 +23,26 @@ def escaped(text: str) -> str:
     return "".join(f"<wbr>{c}" if c in _OF_ADDRESSES else c for c in shown)
 
 
+class Page(Protocol):
+    """What the panel uses of the page (`app.Viewer`)."""
+
+    server: Any
+    session: Session
+
+    @property
+    def detail(self) -> str: ...
+
+    def redraw(self) -> None: ...
+
+    def show_boxes(self, on: bool) -> None: ...
+
+    def guarded(self, action: Callable[[], object], client: Any = None, edited: bool = False) -> None: ...
+
+
 class Panel:
     """Builds viser's controls and updates their texts."""
 
-    def __init__(self, viewer: Viewer):
+    def __init__(self, viewer: Page):
         self.viewer = viewer
         self.session = viewer.session
         self.gui = viewer.server.gui

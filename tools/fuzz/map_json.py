@@ -135,7 +135,7 @@ def _served(folder: Path) -> None:
     from perception.serve.app import build_app, encode
     from perception.serve.engine import QueryEngine
     from perception.serve.mcp import TOOLS, make_server, parse
-    from perception.serve.server import ServeSettings
+    from perception.serve.requests import ServeSettings
 
     with QueryEngine(folder / "a.gsmap", watch=None, workers=1) as engine:
         build_app(engine, ServeSettings())

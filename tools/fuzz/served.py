@@ -57,7 +57,7 @@ class HttpTarget:
     def __init__(self) -> None:
         from perception.serve.app import build_app
         from perception.serve.engine import QueryEngine
-        from perception.serve.server import ServeSettings
+        from perception.serve.requests import ServeSettings
         from support.query_maps import encoders, write_map_of
 
         self._folder = TemporaryDirectory(prefix="fuzz-")

@@ -28,18 +28,10 @@ from perception.node.core import Core
 from perception.node.ros import RosTransport, fill, message_class, spin, stop_on_signals
 from perception.query import Frame, QueryMap
 from perception.query.floor_grid import floor_grid
-from perception.query.requests import (
-    TOP,
-    AnswerTimeout,
-    EngineBusy,
-    EngineClosed,
-    Reply,
-    Request,
-    UnknownFrame,
-    error_kind,
-)
-from perception.query.standing import Stand, where_to_stand
+from perception.query.requests import TOP
+from perception.query.robot_pose import RobotPose, where_to_stand
 from perception.serve.engine import QueryEngine
+from perception.serve.requests import AnswerTimeout, EngineBusy, EngineClosed, Reply, Request, UnknownFrame, error_kind
 from perception_ros import messages
 from perception_ros.frames import FrameFile, read_frame
 
@@ -256,7 +248,7 @@ class MapNode(LifecycleNode):
             frame = self._frame(request.frame_id)
             return self._gate.run(lambda gmap: where_to_stand(gmap, request.instance_id, **lengths, frame=frame))
 
-        def answered(stand: Stand) -> dict[str, Any]:
+        def answered(stand: RobotPose) -> dict[str, Any]:
             pose = messages.stand_pose(stand, _now())
             return {"pose": pose, "distance": stand.distance, "seen": stand.seen}
 
