@@ -119,7 +119,7 @@ class Core:
             except (EngineBusy, EngineClosed) as error:
                 self._send_error(error, question.request.text, question.identity)
             else:
-                future.add_done_callback(lambda done, asked=question: self._answer(asked, done))  # type: ignore[misc]
+                future.add_done_callback(lambda done, question=question: self._answer(question, done))  # type: ignore[misc]
 
     def _answer(self, question: Question, done: Future[Reply]) -> None:
         error = done.exception()
@@ -167,13 +167,13 @@ class Core:
             questions = read_questions(name)
             if len(questions) != 1:
                 raise InputError("query: one text for a name; give further texts as further names")
-            asked = questions[0]
-            reply = asked.request.answered(gmap, time.monotonic())
+            question = questions[0]
+            reply = question.request.answered(gmap, time.monotonic())
         except InputError as error:
             return self._error_value(error, name)
-        if asked.points:
+        if question.points:
             return answers.points_value(reply)
-        return answers.text_value(json.dumps(answers.answer_json(reply, asked.identity), allow_nan=False))
+        return answers.text_value(json.dumps(answers.answer_json(reply, question.identity), allow_nan=False))
 
     def _error_value(self, error: BaseException, name: str) -> Message:
         body = error_json(error, name, identity_of(name))

@@ -17,12 +17,12 @@ class _Points:
     """The field `points`: an array, or a function that is called when they are first read."""
 
     def __get__(self, hit: Hit, owner: type) -> np.ndarray:
-        if callable(given := hit.__dict__["_points"]):
-            given = hit.__dict__["_points"] = given()
-        return np.asarray(given)
+        if callable(points := hit.__dict__["_points"]):
+            points = hit.__dict__["_points"] = points()
+        return np.asarray(points)
 
-    def __set__(self, hit: Hit, given: np.ndarray | Callable[[], np.ndarray]) -> None:
-        hit.__dict__["_points"] = given
+    def __set__(self, hit: Hit, points: np.ndarray | Callable[[], np.ndarray]) -> None:
+        hit.__dict__["_points"] = points
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Hit:
     called; None where they are not known. All of it is in `frame`, in metres when the map is metric.
 
     A hit of a store also has the path of its `map`, `map_id`, and whether that is `metric`. Its points are read from
-    the map's folder when asked for: InputError when that is gone or holds another map.
+    the map's folder when they are used: InputError when that is gone or holds another map.
     """
 
     instance_id: int

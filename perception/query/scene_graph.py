@@ -62,7 +62,8 @@ def scene_graph(gmap: Map) -> networkx.DiGraph:
     if boxes is None or level is None:
         advice = "map photos of a level camera, or a transforms.json with 'gravity'"
         raise InputError(f"{gmap.path}: which way is up is not known, and a scene graph needs it; {advice}")
-    points = [_thinned(gmap.index.of(entry["id"])) @ level.T for entry in gmap.instances]
+    clouds = [gmap.index.of(entry["id"]) for entry in gmap.instances]
+    points = [cloud[:: -(-len(cloud) // MOST_POINTS) or 1].astype(np.float64) @ level.T for cloud in clouds]
     held = holders(points, boxes)
     beside, rooms = boxes.match("beside"), _rooms(gmap)
     shell = _shells(boxes)
@@ -80,19 +81,18 @@ def scene_graph(gmap: Map) -> networkx.DiGraph:
     for n, holder in enumerate(held):
         if holder is not None:
             graph.add_edge(ids[n], ids[holder.position], relation=holder.relation, score=round(holder.score, 3))
+        room = f"room {rooms[n]}"
         if holder is None or shell[holder.position]:
-            room = f"room {rooms[n]}"
             graph.add_node(room, kind="room")
-            if holder is None:
-                graph.add_edge(ids[n], room, relation="in", score=1.0)
-            else:
-                graph.nodes[ids[n]]["room"] = room
+        if holder is None:
+            graph.add_edge(ids[n], room, relation="in", score=1.0)
+        elif shell[holder.position]:
+            graph.nodes[ids[n]]["room"] = room
+    on = [None if holder is None else holder.position for holder in held]
     for a, b in zip(*np.nonzero(np.triu(beside >= MATCH)), strict=True):
-        one, other = held[a], held[b]
-        together = one is not None and other is not None and one.position == other.position
-        if together and not graph.has_edge(ids[a], ids[b]) and not graph.has_edge(ids[b], ids[a]):
-            for i, j in ((a, b), (b, a)):
-                graph.add_edge(ids[i], ids[j], relation="next to", score=round(float(beside[a, b]), 3))
+        apart = not graph.has_edge(ids[a], ids[b]) and not graph.has_edge(ids[b], ids[a])
+        for i, j in ((a, b), (b, a)) if apart and on[a] is not None and on[a] == on[b] else ():
+            graph.add_edge(ids[i], ids[j], relation="next to", score=round(float(beside[a, b]), 3))
     return graph
 
 
@@ -101,15 +101,15 @@ def holders(points: list[np.ndarray], boxes: LevelBoxes) -> list[Holder | None]:
     shell, sizes, inside = _shells(boxes), boxes.highs - boxes.lows, boxes.match("in")
     typical = float(np.median(sizes[~shell].max(axis=1))) if (~shell).any() else 0.0
     trees = {j: cKDTree(cloud) for j, cloud in enumerate(points) if len(cloud)}
-    found: list[Holder | None] = []
+    held: list[Holder | None] = []
     for n, mine in enumerate(points):
         slack = 0.02 * typical + min(0.25 * sizes[n, 2], 0.1 * typical)
-        found.append(None if shell[n] or len(mine) == 0 else _holder(n, points, trees, boxes, shell, inside[n], slack))
-    for n, holder in enumerate(found):  # of two things that hold each other, the lower one stands by itself
-        other = None if holder is None else found[holder.position]
+        held.append(None if shell[n] or len(mine) == 0 else _holder(n, points, trees, boxes, shell, inside[n], slack))
+    for n, holder in enumerate(held):  # of two things that hold each other, nothing holds the lower one
+        other = None if holder is None else held[holder.position]
         if holder is not None and other is not None and other.position == n:
-            found[n if boxes.lows[n, 2] <= boxes.lows[holder.position, 2] else holder.position] = None
-    return found
+            held[n if boxes.lows[n, 2] <= boxes.lows[holder.position, 2] else holder.position] = None
+    return held
 
 
 def _holder(
@@ -159,9 +159,8 @@ def _holder(
             near = points[j][points[j][:, 2] >= low[2] - max(3 * slack, HIDDEN * size[2])]
             near = near[np.isfinite(tree.query(near[:, :2], distance_upper_bound=wide)[0])] if len(near) else near
             below = near[near[:, 2] <= low[2] + slack]
-            if (
-                len(below) and (share := around(below[:, :2])) >= LEAST_RING
-            ):  # a neighbour stands higher beside the thing
+            share = around(below[:, :2])
+            if share >= LEAST_RING:  # a neighbour is higher beside the thing
                 tops.append((float(np.quantile(below[:, 2], 0.9)), share * len(below) / len(near), j))
         if tops:
             best_score = max(score for _, score, _ in tops)
@@ -172,11 +171,6 @@ def _holder(
         return Holder(best, "attached to", touches[best])
     flats = [j for j in under if floors[j] and low[2] - size[2] <= boxes.highs[j, 2] <= low[2] + slack]
     return Holder(max(flats, key=lambda j: boxes.highs[j, 2]), "on", 1 / SECTORS) if flats else None
-
-
-def _thinned(points: np.ndarray) -> np.ndarray:
-    """At most MOST_POINTS, evenly chosen, float64."""
-    return np.asarray(points[:: -(-len(points) // MOST_POINTS) or 1], np.float64)
 
 
 def _shells(boxes: LevelBoxes) -> np.ndarray:

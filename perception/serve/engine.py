@@ -182,7 +182,7 @@ class QueryEngine:
         return InputError(line)
 
     def on_reload(self, listener: Callable[[QueryMap], object]) -> None:
-        """Registers `listener(new map)`, called after each swap by the reloading thread; `health` reports its errors."""
+        """Registers `listener(new map)`, called by the reloading thread after a swap; `health` reports its errors."""
         self._listeners.append(listener)
 
     def open_map(self) -> QueryMap:

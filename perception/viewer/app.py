@@ -141,10 +141,10 @@ class Viewer:
                 points = np.array(box["center"]) + (CORNERS * box["extent"]) @ np.array(box["rotation"])
                 segments = (points[EDGES] * self.scale).astype(np.float32)
                 style = {"thickness": 2, "thickness_units": "screen"}
-                color, place = tuple(instance_palette([number])[0].tolist()), np.array(entry["centroid"]) * self.scale
+                color, middle = tuple(instance_palette([number])[0].tolist()), np.array(entry["centroid"]) * self.scale
                 self._overlays += [
                     scene.add_line_segments(f"/map/boxes/{number}", segments, color, **style),
-                    scene.add_label(f"/map/names/{number}", session.name(entry), position=tuple(place)),
+                    scene.add_label(f"/map/names/{number}", session.name(entry), position=tuple(middle)),
                 ]
         if len(session.ends) == 2:
             ends = (np.array(session.ends) * self.scale).astype(np.float32)
