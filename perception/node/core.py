@@ -23,7 +23,8 @@ from perception.serve.bodies import QueryBody, parse
 from perception.serve.engine import QueryEngine
 from perception.serve.requests import MAX_BYTES, EngineBusy, EngineClosed, Reply, Request, error_kind, error_line
 
-_SHOWN = 80
+_SHOWN = 80  # characters of a prompt in an error
+_LONGEST_ID = 200  # characters
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,8 @@ def read_questions(data: str) -> list[Question]:
     except (ValueError, RecursionError) as error:
         raise InputError(f"prompt: begins like JSON but is none ({error})") from error
     identity, want = value.pop("id", None), value.pop("want", "hits")
-    if identity is not None and not (isinstance(identity, str) and len(identity) <= 200):
-        raise InputError("prompt: id is to be a text of at most 200 characters")
+    if identity is not None and not (isinstance(identity, str) and len(identity) <= _LONGEST_ID):
+        raise InputError(f"prompt: id is to be a text of at most {_LONGEST_ID} characters")
     if want not in ("hits", "points"):
         raise InputError(f"prompt: want is {str(want)[:_SHOWN]!r}, expected hits or points")
     return [Question(request, identity, want == "points") for request in parse(QueryBody, value).requests()]
@@ -63,7 +64,7 @@ def identity_of(data: str) -> str | None:
         identity = json.loads(data).get("id")
     except (ValueError, AttributeError, RecursionError):
         return None
-    return identity if isinstance(identity, str) and len(identity) <= 200 else None
+    return identity if isinstance(identity, str) and len(identity) <= _LONGEST_ID else None
 
 
 def error_json(error: BaseException, text: str, identity: str | None) -> dict[str, Any]:

@@ -109,16 +109,11 @@ class QueryMap(Map):
         return [_in(frame, self._measured(n, wanted)) for n in self._fulfilling(wanted)]
 
     def in_box(self, box: OrientedBox, *, share: float = 0.5, frame: Frame | None = None) -> list[Hit]:
-        """The instances with at least `share` of their points in `box` (see `axis_box` for a box along the axes)."""
+        """The instances with at least `share` of their points in `box` (`axis_box`: a box along the axes)."""
         return self.find(Where(region=box, share=share), frame=frame)
 
     def nearest(
-        self,
-        near: np.ndarray,
-        top_k: int = 1,
-        *,
-        where: Where | None = None,
-        frame: Frame | None = None,
+        self, near: np.ndarray, top_k: int = 1, *, where: Where | None = None, frame: Frame | None = None
     ) -> list[Hit]:
         """The top_k instances nearest to a point [3] or a pose [4, 4] by their nearest point, nearest first, each hit
         with its `distance`. `where` keeps only instances that fulfil it. Raises InputError for top_k below 1."""

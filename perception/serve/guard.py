@@ -143,15 +143,11 @@ class HttpGuard:
 
 
 def _replay(body: bytes, receive: Any) -> Any:
-    sent = False
+    """A `receive` that returns the whole body first."""
+    waiting = [{"type": "http.request", "body": body, "more_body": False}]
 
     async def again() -> Message:
-        nonlocal sent
-        if sent:
-            message: Message = await receive()
-            return message
-        sent = True
-        return {"type": "http.request", "body": body, "more_body": False}
+        return waiting.pop() if waiting else await receive()
 
     return again
 
