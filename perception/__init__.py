@@ -7,12 +7,12 @@ Public names, by what they are for; each has an example:
   `perception.map.write.write_map`
 - ask it: `perception.query.QueryMap`, `perception.query.Hit`, `perception.query.Description`,
   `perception.query.Neighbor`, `perception.query.Where`, `perception.query.axis_box`, `perception.query.Frame`
-- plan with it: `perception.query.scene_graph.scene_graph`, `perception.query.standing.where_to_stand`,
-  `perception.query.standing.Stand`, `perception.query.floor_grid.floor_grid`
+- plan with it: `perception.query.scene_graph.scene_graph`, `perception.query.robot_pose.where_to_stand`,
+  `perception.query.robot_pose.RobotPose`, `perception.query.floor_grid.floor_grid`
 - ask many maps: `perception.query.indexing.index_maps`
-- serve it: `perception.serve.engine.QueryEngine`, `perception.query.requests.Request`,
-  `perception.query.requests.Reply`, `perception.query.requests.EngineBusy`,
-  `perception.query.requests.AnswerTimeout`, `perception.query.requests.EngineClosed`
+- serve it: `perception.serve.engine.QueryEngine`, `perception.serve.requests.Request`,
+  `perception.serve.requests.Reply`, `perception.serve.requests.EngineBusy`,
+  `perception.serve.requests.AnswerTimeout`, `perception.serve.requests.EngineClosed`
 - correct it: `perception.edit.editor.Editor`, `perception.map.write.set_labels`
 - export it: `perception.export.export_map.export_map`, `perception.export.export_map.ExportOptions`,
   `perception.export.mesh.export_mesh`, `perception.export.mesh.export_voxels`

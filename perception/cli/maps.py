@@ -156,7 +156,7 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.export.mesh import check_outputs, export_mesh, export_voxels
     from perception.map.outputs import check_side_file, refuse_inputs
     from perception.map.write import read_map
-    from perception.query.query_map import load_map
+    from perception.query import load_map
     from perception.query.scene_graph import write_graph
 
     if args.output is None and args.mesh is None and args.voxels is None and args.graph is None:

@@ -53,7 +53,7 @@ def _folder(text: str) -> Path:
 def _settings(args: argparse.Namespace, **given: Any) -> Any:
     from perception.config import settings_from
     from perception.serve.listening import read_token
-    from perception.serve.server import ServeSettings
+    from perception.serve.requests import ServeSettings
 
     given["token"] = None if args.token_file is None else read_token(args.token_file)
     return settings_from(ServeSettings, {name: (value, args.command) for name, value in given.items()})

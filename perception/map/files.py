@@ -71,12 +71,12 @@ class MapFiles:
         except OSError as error:
             raise damaged(self.path, str(error)) from error
         if len(self._rows) != facts["num_gaussians"]:
-            found = f"num_gaussians: gaussians.ply holds {len(self._rows)}, found {facts['num_gaussians']}"
-            raise damaged(self.path / FACTS, found)
+            rows = f"num_gaussians: gaussians.ply holds {len(self._rows)}, found {facts['num_gaussians']}"
+            raise damaged(self.path / FACTS, rows)
         for name, array in self._arrays.items():
             if len(array) != len(self._rows):
-                found = f"holds {len(array)} rows, expected {len(self._rows)} as in gaussians.ply"
-                raise damaged(self.path / f"{name}.npy", found)
+                rows = f"holds {len(array)} rows, expected {len(self._rows)} as in gaussians.ply"
+                raise damaged(self.path / f"{name}.npy", rows)
 
     def _map_array(self, name: str, sides: int) -> np.ndarray:
         file = self.path / f"{name}.npy"
@@ -100,12 +100,12 @@ class MapFiles:
             return views_of_facts(self.facts, self.path / FACTS)
         if name in ("language", "parts", "groups"):
             arrays = self._unpack(name)
-            with _telling(self.path / f"{name}.npz"):
+            with _damage_in(self.path / f"{name}.npz"):
                 check_archive(name, arrays, self.instances, len(self._rows))
             return arrays
         self._check_contents()
         if name == "instance_ids":
-            with _telling(self.path / f"{name}.npy"):
+            with _damage_in(self.path / f"{name}.npy"):
                 check_ids(self._arrays[name], [entry["id"] for entry in self.instances])
         if name in _ARRAYS:
             return np.array(self._arrays[name])
@@ -201,7 +201,7 @@ def _read_facts(path: Path) -> tuple[dict[str, Any], bytes]:
             else "it was made by a newer perception; update this one"
         )
         raise InputError(f"{file}: format_version is {brief(version)}, this program reads {FORMAT_VERSION}: {advice}")
-    with _telling(file):
+    with _damage_in(file):
         check_facts(info)
     return info, raw
 
@@ -211,14 +211,14 @@ def _read_instances(file: Path, facts: dict[str, Any]) -> tuple[list[dict[str, A
         raw = file.read_bytes()
     except OSError as error:
         raise damaged(file, f"cannot be read ({error})") from error
-    with _telling(file):
+    with _damage_in(file):
         value = parsed(raw)
         check_instances(value, facts)
     return value["instances"], raw
 
 
 @contextmanager
-def _telling(file: Path) -> Iterator[None]:
+def _damage_in(file: Path) -> Iterator[None]:
     """Turns a ValueError of `map_model` into the InputError for `file`."""
     try:
         yield

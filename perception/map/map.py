@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, Generic, TypeVar, overload
 
 import numpy as np
 
@@ -29,10 +31,10 @@ class InstanceIndex:
 
     def of(self, instance_id: int) -> np.ndarray:
         """The instance's points [P, 3]; P = 0 for an id without Gaussians."""
-        place = int(np.searchsorted(self.ids, instance_id))
-        if place == len(self.ids) or self.ids[place] != instance_id:
+        k = int(np.searchsorted(self.ids, instance_id))
+        if k == len(self.ids) or self.ids[k] != instance_id:
             return self.points[:0]
-        return self.points[self.starts[place] : self.starts[place + 1]]
+        return self.points[self.starts[k] : self.starts[k + 1]]
 
 
 def build_index(means: np.ndarray, instance_ids: np.ndarray) -> InstanceIndex:
@@ -47,9 +49,11 @@ def build_index(means: np.ndarray, instance_ids: np.ndarray) -> InstanceIndex:
     return InstanceIndex(ids.astype(np.int64), starts, points)
 
 
+T = TypeVar("T")
 M = TypeVar("M", bound="Map")
 GAUSSIANS = ("means", "quats", "log_scales", "opacity_logits", "sh", "features", "instance_ids", "membership")
 """Fields with one row per Gaussian."""
+_FIELDS = (*GAUSSIANS, "instances", "info", "views", "language", "parts", "groups")
 
 
 def language_in(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -70,6 +74,38 @@ class PhotosMoved(UserWarning):
     """Warning: photos of a map are missing, or their files have changed since the map was made."""
 
 
+class Lazy(Generic[T]):
+    """A field of `Map`. One that was not given is read from the map's files when it is first used, or made by `empty`
+    in a map without files. Concurrent threads get the same value."""
+
+    def __init__(self, empty: Callable[[], T] | None = None) -> None:
+        self._empty = empty
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    @overload
+    def __get__(self, gmap: None, owner: type) -> Any: ...
+    @overload
+    def __get__(self, gmap: Map, owner: type) -> T: ...
+    def __get__(self, gmap: Map | None, owner: type) -> Any:
+        if gmap is None:  # the default value of the field
+            return self
+        if self._name not in gmap.__dict__:
+            if gmap.files is not None:
+                value = gmap.files.read(self._name)
+            elif self._empty is not None:
+                value = self._empty()
+            else:
+                raise AttributeError(f"{owner.__name__}: was made without {self._name}")
+            gmap.__dict__.setdefault(self._name, value)
+        return gmap.__dict__[self._name]
+
+    def __set__(self, gmap: Map, value: T) -> None:
+        if value is not self:
+            gmap.__dict__[self._name] = value
+
+
 @dataclass(eq=False, repr=False)
 class Map:
     """A finished map, in memory (made from its fields) or on disk (`Map.open`: a field is read when first used).
@@ -77,7 +113,7 @@ class Map:
     Arrays are float32: means [N, 3], quats [N, 4] wxyz, log_scales [N, 3], opacity_logits [N], sh [N, K, 3], as the PLY
     stores them; features [N, D], membership [N], and instance_ids [N] int32, −1 = none. instances: the list of
     instances.json. info: map.json without the views. views: the photos it was made from, sorted by name, `StoredView`
-    in a map read from disk. language, parts, groups: named arrays (see io.store), possibly empty. index: the points
+    in a map read from disk. language, parts, groups: named arrays (see map.write), possibly empty. index: the points
     of each instance. Reading a field raises InputError naming the file when it is damaged. The folder may be replaced
     by another map meanwhile. This type needs no torch; training uses `gaussians.model.Gaussians`, which holds the same
     values as torch tensors.
@@ -87,58 +123,45 @@ class Map:
     ((3000, 3), dtype('float32'), np.int32(-1))
     """
 
-    means: np.ndarray
-    quats: np.ndarray
-    log_scales: np.ndarray
-    opacity_logits: np.ndarray
-    sh: np.ndarray
-    features: np.ndarray
-    instance_ids: np.ndarray
-    membership: np.ndarray
-    instances: list[dict[str, Any]] = field(default_factory=list)
-    info: dict[str, Any] = field(default_factory=dict)
-    views: list[View] = field(default_factory=list)
-    language: dict[str, np.ndarray] = field(default_factory=dict)
-    parts: dict[str, np.ndarray] = field(default_factory=dict)
-    groups: dict[str, np.ndarray] = field(default_factory=dict)
+    means: Lazy[np.ndarray] = Lazy()
+    quats: Lazy[np.ndarray] = Lazy()
+    log_scales: Lazy[np.ndarray] = Lazy()
+    opacity_logits: Lazy[np.ndarray] = Lazy()
+    sh: Lazy[np.ndarray] = Lazy()
+    features: Lazy[np.ndarray] = Lazy()
+    instance_ids: Lazy[np.ndarray] = Lazy()
+    membership: Lazy[np.ndarray] = Lazy()
+    instances: Lazy[list[dict[str, Any]]] = Lazy(list)
+    info: Lazy[dict[str, Any]] = Lazy(dict)
+    views: Lazy[list[View]] = Lazy(list)
+    language: Lazy[dict[str, np.ndarray]] = Lazy(dict)
+    parts: Lazy[dict[str, np.ndarray]] = Lazy(dict)
+    groups: Lazy[dict[str, np.ndarray]] = Lazy(dict)
     path: Path | None = None
-    index: InstanceIndex = field(init=False)
-    _files: MapFiles | None = field(default=None, init=False)
+    files: MapFiles | None = None
     _warned: bool = field(default=False, init=False)
 
     @classmethod
-    def open(cls: type[M], path: Path) -> M:
+    def open(cls: type[M], path: Path, **fields: Any) -> M:
         """The map on disk at `path`; InputError when it is missing, damaged, or of an unknown version."""
-        gmap = cls.__new__(cls)
-        gmap.path, gmap._files = Path(path), MapFiles(path)
-        return gmap
+        return cls(path=Path(path), files=MapFiles(path), **fields)
 
     @classmethod
     def of(cls: type[M], gmap: Map, **changes: Any) -> M:
         """`gmap` as an instance of this class, with `changes` to its fields; arrays are shared, not read."""
-        made = cls.__new__(cls)
-        made.path, made._files = gmap.path, gmap._files
-        shared = _FIELDS if changes.keys() & {"means", "instance_ids"} else (*_FIELDS, "index")
-        made.__dict__.update({name: value for name, value in vars(gmap).items() if name in shared} | changes)
-        return made
+        known = {name: value for name, value in vars(gmap).items() if name in _FIELDS}
+        return cls(path=gmap.path, files=gmap.files, **{**known, **changes})
 
-    if not TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> Any:
-            """Reads a field at its first use; concurrent threads get the same value."""
-            if name == "index":
-                value = build_index(self.means, self.instance_ids)
-            elif name in _FIELDS and self._files is not None:
-                value = self._files.read(name)
-            else:
-                raise AttributeError(f"{type(self).__name__} has no attribute '{name}'")
-            return self.__dict__.setdefault(name, value)
+    @cached_property
+    def index(self) -> InstanceIndex:
+        """The points of each instance."""
+        return build_index(self.means, self.instance_ids)
 
     def load(self: M) -> M:
         """Reads all fields now and closes the files."""
         for name in _FIELDS:
             getattr(self, name)
-        self._files = None
+        self.files = None
         return self
 
     def __len__(self) -> int:
@@ -170,7 +193,7 @@ class Map:
     @property
     def map_id(self) -> str:
         """Short identifier of the map and its labels; it changes when either changes."""
-        return "unsaved" if self._files is None else self._files.map_id
+        return "unsaved" if self.files is None else self.files.map_id
 
     def setting(self, group: str, name: str, default: Any) -> Any:
         """The setting GROUP.NAME that the map was made with; `default` where it is not recorded, or is none."""
@@ -194,10 +217,6 @@ class Map:
 
         return tensor_cloud(self.means, rgb8_from_sh(self.sh[:, 0]), self.instance_ids)
 
-    def colors_of(self, instance_id: int) -> np.ndarray:
-        """Colours [P, 3] uint8 of an instance's points, in the order of `index`."""
-        return rgb8_from_sh(self.sh[self.instance_ids == instance_id, 0])
-
     def with_photo(self, view: View) -> View:
         """`view` with the current path of its photo; InputError when the photo is missing or has changed.
         The first such error of a map also issues a PhotosMoved warning."""
@@ -211,13 +230,10 @@ class Map:
 
     def located_views(self) -> list[View]:
         """`with_photo` of all views; views whose photo is missing get an empty path."""
-        found = []
+        views = []
         for view in self.views:
             try:
-                found.append(self.with_photo(view))
+                views.append(self.with_photo(view))
             except InputError:
-                found.append(replace(view, photo=Path()))
-        return found
-
-
-_FIELDS = (*GAUSSIANS, "instances", "info", "views", "language", "parts", "groups")
+                views.append(replace(view, photo=Path()))
+        return views

@@ -95,16 +95,18 @@ def check_instances(value: Any, facts: dict[str, Any]) -> None:
     """ValueError unless `value`, of instances.json, fits the model and `facts`, of map.json."""
     check(INSTANCES, value)
     entries, seen = value["instances"], set()
-    for n, whole in enumerate(entries):
-        check(INSTANCE, whole, f"instances[{n}]")  # each alone: what is checked is copied, and 20,000 copies cost time
-        for entry in (whole, *whole.get("parts", ())):
+    for n, instance in enumerate(entries):
+        check(
+            INSTANCE, instance, f"instances[{n}]"
+        )  # each alone: what is checked is copied, and 20,000 copies cost time
+        for entry in (instance, *instance.get("parts", ())):
             if entry["id"] in seen:
                 raise ValueError(f"id: {entry['id']} occurs twice")
             seen.add(entry["id"])
             if entry["num_gaussians"] > facts["num_gaussians"]:
                 raise ValueError(f"num_gaussians: instance {entry['id']} has more than the map")
-            if entry is not whole and entry.get("parent") != whole["id"]:
-                raise ValueError(f"parent: that of part {entry['id']} is not {whole['id']}")
+            if entry is not instance and entry.get("parent") != instance["id"]:
+                raise ValueError(f"parent: that of part {entry['id']} is not {instance['id']}")
             if not entry.keys() <= _KNOWN:
                 json.dumps({name: entry[name] for name in entry.keys() - _KNOWN}, allow_nan=False)
     if len(entries) != facts["num_instances"]:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from perception.colors import instance_palette, rgb8_from_sh
 from perception.query import Hit, QueryMap
-from perception.query.requests import Reply
+from perception.serve.requests import Reply
 from perception.types import OrientedBox
 
 
@@ -60,11 +60,12 @@ _OK, _WARN, _ERROR = 0, 1, 2  # diagnostic_msgs/DiagnosticStatus
 
 def answer_json(reply: Reply, identity: str | None) -> dict[str, Any]:
     """An entry of `results` with the prompt's id and the map's frame, unit and id."""
-    facts = {"frame": reply.frame, "metric": reply.metric, "map_id": reply.map_id}
-    return {"id": identity, **reply.to_json(), **facts}
+    of_map = {"frame": reply.frame, "metric": reply.metric, "map_id": reply.map_id}
+    return {"id": identity, **reply.to_json(), **of_map}
 
 
 def stamp_json(stamp: Stamp) -> dict[str, int]:
+    """builtin_interfaces/Time, as a message and as JSON."""
     return {"sec": stamp[0], "nanosec": stamp[1]}
 
 
@@ -85,20 +86,16 @@ def _hit_columns(hits: Sequence[Hit]) -> dict[str, np.ndarray]:
 
 def hits_detections(reply: Reply, stamp: Stamp) -> dict[str, Any]:
     """Detection3DArray: id is the instance's, class_id the prompt's text, the score that of the hit."""
-    head = header(reply.frame, stamp)
-    found = [
-        detection(hit.obb, reply.request.text, hit.score, str(hit.instance_id), head, hit.covariance)
-        for hit in reply.hits
-    ]
-    return {"header": head, "detections": found}
+    head, text = header(reply.frame, stamp), reply.request.text
+    made = [detection(hit.obb, text, hit.score, str(hit.instance_id), head, hit.covariance) for hit in reply.hits]
+    return {"header": head, "detections": made}
 
 
 def hits_markers(reply: Reply, identity: str | None, stamp: Stamp) -> dict[str, Any]:
     """MarkerArray: a box and a text for each hit; ns is the prompt's id, else its text."""
-    boxes = [
-        (hit.instance_id, hit.obb, f"{reply.request.text} #{hit.instance_id} {hit.score:.2f}") for hit in reply.hits
-    ]
-    return box_markers(boxes, identity or reply.request.text, header(reply.frame, stamp))
+    text = reply.request.text
+    boxes = [(hit.instance_id, hit.obb, f"{text} #{hit.instance_id} {hit.score:.2f}") for hit in reply.hits]
+    return box_markers(boxes, identity or text, header(reply.frame, stamp))
 
 
 def text_value(text: str) -> dict[str, Any]:
@@ -126,12 +123,11 @@ def map_cloud(gmap: QueryMap, most: int, stamp: Stamp) -> dict[str, Any]:
 def diagnostics(name: str, facts: Mapping[str, Any], warnings: Sequence[str], stamp: Stamp) -> dict[str, Any]:
     """DiagnosticArray of the engine's health and the transport's warnings."""
     problem = facts.get("problem")
+    level, message = _OK, "serving"
     if facts.get("status") == "closed":
         level, message = _ERROR, "closed"
     elif problem or warnings:
         level, message = _WARN, "; ".join([*([str(problem)] if problem else []), *warnings])
-    else:
-        level, message = _OK, "serving"
     status = {
         "level": level,
         "name": f"{name}: instance map",
@@ -144,7 +140,7 @@ def diagnostics(name: str, facts: Mapping[str, Any], warnings: Sequence[str], st
 
 def header(frame: str, stamp: Stamp) -> dict[str, Any]:
     """std_msgs/Header."""
-    return {"stamp": {"sec": stamp[0], "nanosec": stamp[1]}, "frame_id": frame}
+    return {"stamp": stamp_json(stamp), "frame_id": frame}
 
 
 def point_cloud2(columns: Mapping[str, np.ndarray], frame: str, stamp: Stamp) -> dict[str, Any]:
@@ -197,7 +193,7 @@ def box_markers(boxes: Iterable[tuple[int, OrientedBox, str]], namespace: str, h
     (instance id, box, text) a transparent box in the instance's colour and its text. Viewers reject sides
     of length 0, so sides are at least LEAST_SIDE."""
     markers: list[dict[str, Any]] = [{"header": head, "action": _DELETE_ALL}]
-    for i, (instance, box, words) in enumerate(boxes):
+    for i, (instance, box, label) in enumerate(boxes):
         at, common = pose(box), {"header": head, "ns": namespace}
         size = {axis: max(side, LEAST_SIDE) for axis, side in xyz(box.extent).items()}
         tint = dict(zip("rgb", (instance_palette([instance])[0] / 255).tolist(), strict=True)) | {"a": 0.4}
@@ -205,7 +201,7 @@ def box_markers(boxes: Iterable[tuple[int, OrientedBox, str]], namespace: str, h
         upright = {"position": at["position"], "orientation": {"w": 1.0}}
         letters = {"z": max(0.25 * min(size.values()), 0.1 * max(size.values()))}
         white = dict.fromkeys("rgba", 1.0)
-        text = {"type": _TEXT, "pose": upright, "scale": letters, "color": white, "text": words}
+        text = {"type": _TEXT, "pose": upright, "scale": letters, "color": white, "text": label}
         markers.append({**common, "id": 2 * i + 1, **text})
     return {"markers": markers}
 

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from perception.config import settings_from
 from perception.errors import InputError
-from perception.query.requests import EngineSettings
+from perception.serve.requests import EngineSettings
 
 
 class NodeConfig(EngineSettings):

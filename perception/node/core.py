@@ -19,11 +19,12 @@ from perception.errors import InputError
 from perception.node import answers
 from perception.node.config import NodeConfig
 from perception.query import QueryMap
-from perception.query.requests import MAX_BYTES, EngineBusy, EngineClosed, Reply, Request, error_kind, error_line
 from perception.serve.bodies import QueryBody, parse
 from perception.serve.engine import QueryEngine
+from perception.serve.requests import MAX_BYTES, EngineBusy, EngineClosed, Reply, Request, error_kind, error_line
 
-_SHOWN = 80
+_SHOWN = 80  # characters of a prompt in an error
+_LONGEST_ID = 200  # characters
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,8 @@ def read_questions(data: str) -> list[Question]:
     except (ValueError, RecursionError) as error:
         raise InputError(f"prompt: begins like JSON but is none ({error})") from error
     identity, want = value.pop("id", None), value.pop("want", "hits")
-    if identity is not None and not (isinstance(identity, str) and len(identity) <= 200):
-        raise InputError("prompt: id is to be a text of at most 200 characters")
+    if identity is not None and not (isinstance(identity, str) and len(identity) <= _LONGEST_ID):
+        raise InputError(f"prompt: id is to be a text of at most {_LONGEST_ID} characters")
     if want not in ("hits", "points"):
         raise InputError(f"prompt: want is {str(want)[:_SHOWN]!r}, expected hits or points")
     return [Question(request, identity, want == "points") for request in parse(QueryBody, value).requests()]
@@ -63,7 +64,7 @@ def identity_of(data: str) -> str | None:
         identity = json.loads(data).get("id")
     except (ValueError, AttributeError, RecursionError):
         return None
-    return identity if isinstance(identity, str) and len(identity) <= 200 else None
+    return identity if isinstance(identity, str) and len(identity) <= _LONGEST_ID else None
 
 
 def error_json(error: BaseException, text: str, identity: str | None) -> dict[str, Any]:
@@ -119,7 +120,7 @@ class Core:
             except (EngineBusy, EngineClosed) as error:
                 self._send_error(error, question.request.text, question.identity)
             else:
-                future.add_done_callback(lambda done, asked=question: self._answer(asked, done))  # type: ignore[misc]
+                future.add_done_callback(lambda done, question=question: self._answer(question, done))  # type: ignore[misc]
 
     def _answer(self, question: Question, done: Future[Reply]) -> None:
         error = done.exception()
@@ -167,13 +168,13 @@ class Core:
             questions = read_questions(name)
             if len(questions) != 1:
                 raise InputError("query: one text for a name; give further texts as further names")
-            asked = questions[0]
-            reply = asked.request.answered(gmap, time.monotonic())
+            question = questions[0]
+            reply = question.request.answered(gmap, time.monotonic())
         except InputError as error:
             return self._error_value(error, name)
-        if asked.points:
+        if question.points:
             return answers.points_value(reply)
-        return answers.text_value(json.dumps(answers.answer_json(reply, asked.identity), allow_nan=False))
+        return answers.text_value(json.dumps(answers.answer_json(reply, question.identity), allow_nan=False))
 
     def _error_value(self, error: BaseException, name: str) -> Message:
         body = error_json(error, name, identity_of(name))

@@ -47,8 +47,8 @@ class RosTransport:
         return self._answerers()
 
     def _answerers(self) -> int:
-        found = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(answers.ANSWER.name))
-        return max(0, len(found) - (answers.ANSWER in self._publishers))
+        publishers = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(answers.ANSWER.name))
+        return max(0, len(publishers) - (answers.ANSWER in self._publishers))
 
     def open(self) -> None:
         """Creates the publishers. A topic whose type is not installed (vision_msgs) is skipped; see `figures`."""
@@ -87,11 +87,11 @@ class RosTransport:
             _qos(False),
             callback_group=MutuallyExclusiveCallbackGroup(),
         )
-        asked: dict[Channel, Callable[[Any, Any], Any]] = {
+        services: dict[Channel, Callable[[Any, Any], Any]] = {
             answers.QUERY: lambda request, response: self._query(core, request, response),
             answers.RELOAD: lambda _, response: fill(response, core.reload()),
         }
-        for service, answer in asked.items():
+        for service, answer in services.items():
             node.create_service(message_class(service.kind), service.name, answer, callback_group=calls)
         node.create_timer(self.config.health_seconds, core.send_health, callback_group=MutuallyExclusiveCallbackGroup())
 

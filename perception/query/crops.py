@@ -20,7 +20,7 @@ from perception.types import View
 MARGIN = 0.15
 """Margin around the bounding box, as a share of its longer side."""
 OUTSIDE = "photos outside the map's folder are not shown; --photos DIR shows those in DIR"
-"""What a server tells of a map that names such photos."""
+"""What a server answers for a map that names such photos."""
 
 
 class PhotoOutside(InputError):
@@ -35,16 +35,17 @@ def best_crop(gmap: QueryMap, instance_id: int, side: int = 320, photos: Path | 
     """
     from perception.photos.decode import load_photo
 
-    found = gmap.best_view(instance_id)
-    if found is None:
+    best = gmap.best_view(instance_id)
+    if best is None:
         return None
+    view, box = best
     try:
-        photo = load_photo(readable_view(gmap, found[0], photos), gmap.setting("photos", "max_side", MAX_SIDE))
+        photo = load_photo(readable_view(gmap, view, photos), gmap.setting("photos", "max_side", MAX_SIDE))
     except PhotoOutside:
         raise
     except (InputError, OSError, ValueError, KeyError, TypeError):
         return None
-    return cut_out(photo, found[1], side)
+    return cut_out(photo, box, side)
 
 
 def cut_out(picture: np.ndarray, box: tuple[int, int, int, int], side: int) -> np.ndarray | None:
@@ -68,9 +69,9 @@ def readable_view(gmap: Map, view: View, photos: Path | None = None) -> View:
     if not allowed:
         raise PhotoOutside(f"{view.name}: {OUTSIDE}")
     view = replace(view, photo_beside=None) if isinstance(view, StoredView) else view
-    for place in allowed[:-1]:
+    for file in allowed[:-1]:
         with suppress(InputError):  # missing, or another file
-            return replace(view, photo=locate_photo(replace(view, photo=place), None))
+            return replace(view, photo=locate_photo(replace(view, photo=file), None))
     return gmap.with_photo(replace(view, photo=allowed[-1]))
 
 
@@ -83,11 +84,11 @@ def _allowed(gmap: Map, view: View, photos: Path | None) -> list[Path]:
     """The real paths that the map states for a photo, of those in its folder or in `photos`, by name and by links."""
     folders = [folder for folder in (gmap.path, photos) if folder is not None]
     beside = getattr(view, "photo_beside", None)
-    places = [*([] if beside is None or gmap.path is None else [gmap.path / beside]), view.photo]
+    files = [*([] if beside is None or gmap.path is None else [gmap.path / beside]), view.photo]
     real = [folder.resolve() for folder in folders]
-    found = []
-    for place in places:
+    allowed = []
+    for file in files:
         with suppress(OSError, ValueError, RuntimeError):  # an invalid path, or a cycle of symbolic links
-            if any(absolute(place).is_relative_to(folder) for folder in (*map(absolute, folders), *real)):
-                found.append(place.resolve())
-    return [place for place in found if any(place.is_relative_to(folder) for folder in real)]
+            if any(absolute(file).is_relative_to(folder) for folder in (*map(absolute, folders), *real)):
+                allowed.append(file.resolve())
+    return [file for file in allowed if any(file.is_relative_to(folder) for folder in real)]

@@ -22,7 +22,7 @@ DISC = [(u, v) for u, v in product(np.linspace(-1, 1, 5), repeat=2) if np.hypot(
 @dataclass(frozen=True)
 class Surface:
     """Points on the surfaces of a metric map: the disc of each opaque Gaussian, of one standard deviation along its two
-    longest axes, at 13 places.
+    longest axes, sampled at 13 points.
 
     points [P, 3] float64: x, y, height above the floor, metres. rows [P]: their Gaussians. map_from_level [4, 4],
     rigid: its origin is on the floor, z is up, x as near to the map's x as a level axis can be. path: of the map.
@@ -37,14 +37,14 @@ class Surface:
         """`floor_grid` of these points."""
         points = self.points
         points = points[(np.abs(points[:, 2]) <= step) | ((points[:, 2] > 0) & (points[:, 2] <= HEIGHT))]
-        cells, stands = np.floor(points[:, :2] / resolution).astype(np.int64), points[:, 2] > step
-        if stands.all():
+        cells, occupied = np.floor(points[:, :2] / resolution).astype(np.int64), points[:, 2] > step
+        if occupied.all():
             raise InputError(f"{self.path}: has no floor below its cameras")
         low, size = cells.min(axis=0), np.ptp(cells, axis=0) + 1
         if size.astype(float).prod() > MOST_CELLS:
             raise InputError(f"{self.path}: has more than {MOST_CELLS} cells of {resolution} m; choose larger ones")
         grid = np.full(size[::-1], UNKNOWN, np.int8)
-        for rows, value in ((~stands, FREE), (stands, OCCUPIED)):
+        for rows, value in ((~occupied, FREE), (occupied, OCCUPIED)):
             grid[tuple((cells[rows] - low).T[::-1])] = value
         level_from_grid = np.eye(4)
         level_from_grid[:2, 3] = low * resolution

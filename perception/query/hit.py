@@ -17,12 +17,12 @@ class _Points:
     """The field `points`: an array, or a function that is called when they are first read."""
 
     def __get__(self, hit: Hit, owner: type) -> np.ndarray:
-        if callable(given := hit.__dict__["_points"]):
-            given = hit.__dict__["_points"] = given()
-        return np.asarray(given)
+        if callable(points := hit.__dict__["_points"]):
+            points = hit.__dict__["_points"] = points()
+        return np.asarray(points)
 
-    def __set__(self, hit: Hit, given: np.ndarray | Callable[[], np.ndarray]) -> None:
-        hit.__dict__["_points"] = given
+    def __set__(self, hit: Hit, points: np.ndarray | Callable[[], np.ndarray]) -> None:
+        hit.__dict__["_points"] = points
 
 
 @dataclass(frozen=True)

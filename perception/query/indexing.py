@@ -21,9 +21,9 @@ from perception.language.encoders import make_encoder
 from perception.map.checksums import FACTS, STORE
 from perception.map.replace import writing
 from perception.progress import QUIET, Progress
-from perception.query.map_store import FORMAT_VERSION, TOLD, read_store
-from perception.query.query_map import QueryMap, load_map
-from perception.query.relations import Places
+from perception.query.map_store import FORMAT_VERSION, RECORD, THING, read_store
+from perception.query.query_map import QueryMap
+from perception.query.relations import LevelBoxes
 from perception.query.text_ranking import Encoders, encoder_name, printed_on
 
 _NAME = re.compile(r"\.?[0-9a-f]{32}\.npz(?P<unfinished>\.new-\d+-\w{8})?")
@@ -65,7 +65,7 @@ def index_maps(
                 raise InputError(f"{path}: is no map (no {FACTS} inside); the store is as it was")
         for n, path in enumerate(paths, start=1):
             before = entries.get(str(path))
-            gmap = load_map(path, encoders)
+            gmap = QueryMap.open(path, encoders=encoders)
             if before is None or before["map_id"] != gmap.map_id:
                 entries[str(path)] = _indexed(store, gmap, facts)
             counts["added" if before is None else "unchanged" if entries[str(path)] is before else "replaced"] += 1
@@ -97,10 +97,10 @@ def _facts(store: Path) -> dict[str, Any]:
 
 def _is_ours(file: Path) -> bool:
     """Whether a file in the folder maps/ was written here, completely or not: by its name, and by what it holds."""
-    found = _NAME.fullmatch(file.name)
-    if found is None or file.is_symlink() or not file.is_file():
+    name = _NAME.fullmatch(file.name)
+    if name is None or file.is_symlink() or not file.is_file():
         return False
-    if found["unfinished"]:
+    if name["unfinished"]:
         return True
     try:
         with zipfile.ZipFile(file) as archive:
@@ -117,8 +117,8 @@ def _indexed(store: Path, gmap: QueryMap, facts: dict[str, Any]) -> dict[str, An
     identity = str(gmap.language["encoder"])
     known = facts["encoder"] = facts["encoder"] or {"name": encoder_name(gmap), "identity": identity}
     if known["identity"] != identity:
-        found = f"its embeddings were made by '{identity}', those of {store} by '{known['identity']}'"
-        raise InputError(f"{path}: {found}; run: perception upgrade MAP, or give another store")
+        made = f"its embeddings were made by '{identity}', those of {store} by '{known['identity']}'"
+        raise InputError(f"{path}: {made}; run: perception upgrade MAP, or give another store")
     key = json.dumps([str(path), gmap.map_id, identity, FORMAT_VERSION])
     file = hashlib.sha256(key.encode()).hexdigest()[:32] + ".npz"
     if not (store / "maps" / file).is_file():
@@ -132,18 +132,27 @@ def _indexed(store: Path, gmap: QueryMap, facts: dict[str, Any]) -> dict[str, An
 
 def _arrays(gmap: QueryMap) -> dict[str, np.ndarray]:
     """The arrays of a map's file."""
-    prepared, places, told = gmap.ranker.prepared(), Places.of(gmap), np.zeros(len(gmap.instances), TOLD)
+    ranker, boxes, count = gmap.ranker, LevelBoxes.of(gmap), len(gmap.instances)
+    prepared, things, records = ranker.prepared, np.zeros(count, THING), np.zeros(count, RECORD)
+    for name in ("seen", "null", "colors", "sides"):
+        things[name] = getattr(prepared, name)
+    things["shapes"] = np.nan if ranker.shapes is None else ranker.shapes
     views = []
-    for n in range(len(told)):
+    for n in range(count):
         hit = gmap.hit(n)
         box = hit.obb.center, hit.obb.rotation, hit.obb.extent
-        told[n] = (hit.instance_id, len(hit.points), hit.centroid, *box, hit.covariance)
+        records[n] = (hit.instance_id, len(hit.points), hit.centroid, *box, hit.covariance)
         views.append(hit.views)
     texts = None if printed_on(gmap) is None else [entry.get("texts", []) for entry in gmap.instances]
     names = {"labels": [entry.get("label") for entry in gmap.instances], "texts": texts}
-    where = {} if places is None else {"places": np.stack([places.lows, places.highs], axis=1), "poses": places.poses}
-    records = {"things": _rows(prepared.pop("things")), "told": _rows(told)}
-    return {**prepared, **records, **where, "names": _text(names), "views": _text(views)}
+    level = {} if boxes is None else {"places": np.stack([boxes.lows, boxes.highs], axis=1), "poses": boxes.poses}
+    plain = prepared.plain if len(ranker.encoder.canonical) else prepared.plain[:, :0]
+    parts = {f"part_{n}": rows for n, rows in enumerate(prepared.compared)}
+    labels = {"label_rows": prepared.label_rows, "label_null": prepared.label_null}
+    return {
+        **{"things": _rows(things), "told": _rows(records), "names": _text(names), "views": _text(views)},
+        **{**parts, "plain": plain, **labels, **level},
+    }
 
 
 def _rows(records: np.ndarray) -> np.ndarray:

@@ -1,17 +1,17 @@
 """A store: the instances of many maps in one folder, which answers prompts with the scores of the instances' own maps.
-docs/formats.md lists its files; a file of maps/ holds the arrays of `Ranker.prepared`, told [I] of `TOLD`, and places
-[I, 2, 3] and poses [C, 4, 4] of `Places` (absent where up is not known). It is named by a digest of path and map_id.
+
+docs/formats.md lists its files. A file of maps/ holds what `indexing` prepares of one map: `THING` and `RECORD` [I]; of
+`ranking.Prepared`: plain, label_rows, label_null and compared (part_0, part_1, …); of `relations.LevelBoxes`, places
+[I, 2, 3] and poses [C, 4, 4] (absent where up is not known). It is named by a digest of path and map_id.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
-from dataclasses import fields
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,96 +19,91 @@ from perception.errors import InputError
 from perception.io.arrays import read_npz
 from perception.io.documents import brief
 from perception.io.json_shapes import check, parsed
+from perception.language.colors import COLOR_WORDS
 from perception.language.description import check_encoder
 from perception.language.encoders import make_encoder
 from perception.language.printed import Printed, quoted_text
+from perception.language.shape_words import KINDS
 from perception.machine import torch_on_one_thread
 from perception.map.checksums import STORE
-from perception.map.map import Map
 from perception.map.model import NAMES, STORED
 from perception.query.hit import Hit
 from perception.query.query_map import QueryMap
-from perception.query.ranking import THING, Ranker, least_score
-from perception.query.relations import WEIGHT, Places, parse, standing
-from perception.query.requests import MAX_TOP, TOP, Request
-from perception.query.text_ranking import REMEMBERED
+from perception.query.ranking import Prepared, Scorer, TextEncoder, least_score
+from perception.query.relations import WEIGHT, LevelBoxes, fulfilled, parse
+from perception.query.requests import MAX_TOP, TOP, check_prompt
+from perception.query.text_ranking import REMEMBERED, Encoders
 from perception.query.where import Frame, Where, tidy
 from perception.types import OrientedBox
 
 FORMAT_VERSION = 1
 """Of the store, and of what ranking prepares: other numbers there need another version here."""
-TOLD = np.dtype(
-    [
-        *(("id", "i8"), ("points", "i8"), ("centroid", "f8", 3), ("center", "f8", 3), ("rotation", "f8", (3, 3))),
-        *(("extent", "f8", 3), ("covariance", "f8", (3, 3))),
-    ]
-)
-"""What a hit tells of an instance; points: their number."""
-_RECORDS = {"things": THING, "told": TOLD}
+_COLORS, _SHAPES = ("colors", "f8", len(COLOR_WORDS)), ("shapes", "f8", len(KINDS))
+THING = np.dtype([("seen", "?"), ("null", "f8", 2), _COLORS, ("sides", "f8", 3), _SHAPES])
+"""Of `ranking.Prepared`, and the scores of `shape_words.KINDS`; NaN where not known."""
+_BOX = (("center", "f8", 3), ("rotation", "f8", (3, 3)), ("extent", "f8", 3))
+RECORD = np.dtype([("id", "i8"), ("points", "i8"), ("centroid", "f8", 3), *_BOX, ("covariance", "f8", (3, 3))])
+"""The fields of a hit; points: their number."""
+_RECORDS = {"things": THING, "told": RECORD}
 _RAGGED = ("label_rows", "label_null", "places", "poses", "names", "views")
 _TRIES = 5
 _OPENED = 8  # maps whose points are kept in memory
 
 
-class MapStore(QueryMap):
+class MapStore:
     """Many maps that answer prompts as one. Each instance has the score that it has in its own map, and answers when it
-    does there; parts and groups of instances are not held. Whatever else a map can do raises InputError.
+    does there; parts and groups of instances are not held. What a `QueryMap` can do beside raises InputError.
 
-    All is read at opening, so the store's folder may change meanwhile. Thread-safe.
+    All is read at opening, so the store's folder may change meanwhile. Thread-safe. encoders: as of `QueryMap`.
+    InputError when the store at `path` is damaged or of an unknown version.
     """
 
-    path: Path
-    _facts: dict[str, Any]
-    _store_id: str
-    _chosen: Callable[[str, float | None], list[tuple[int, float]]]
-    _opened: Any
-
-    if not TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> Any:
-            if name in {field.name for field in fields(Map)}:
-                raise InputError(f"{self.path}: is a store of many maps, and this needs one map; give one of them")
-            raise AttributeError(f"{type(self).__name__} has no attribute '{name}'")
-
-    @classmethod
-    def open(cls, path: Path) -> MapStore:
-        """The store at `path`; InputError when it is damaged or of an unknown version."""
-        made = cls.__new__(cls)
-        made.path = Path(path)
+    def __init__(self, path: Path, encoders: Encoders | None = None) -> None:
+        self.path, self.encoders = path, encoders
         for left in reversed(range(_TRIES)):
-            made._facts, raw = read_store(made.path)
-            made._store_id = hashlib.sha256(raw).hexdigest()[:12]
+            facts, raw = read_store(path)
             try:
-                made._read()
+                self._maps = _Maps(path, facts["maps"])
                 break
             except InputError:
-                if not left or read_store(made.path)[1] == raw:  # else it was replaced meanwhile
+                if not left or read_store(path)[1] == raw:  # else it was replaced meanwhile
                     raise
-        made._chosen = lru_cache(REMEMBERED)(made._answering)
-        made._opened = lru_cache(_OPENED)(QueryMap.open)
-        return made
+        self.map_id = hashlib.sha256(raw).hexdigest()[:12]
+        """Short identifier, which changes when any of the maps does."""
+        self._encoder = facts["encoder"]
+        self._chosen = lru_cache(REMEMBERED)(self._answering)
+        self._opened = lru_cache(_OPENED)(QueryMap.open)
+
+    def __getattr__(self, name: str) -> Any:
+        if hasattr(QueryMap, name):
+            raise InputError(f"{self.path}: is a store of many maps, and this needs one map; give one of them")
+        raise AttributeError(f"{type(self).__name__} has no attribute '{name}'")
 
     @property
     def maps(self) -> list[dict[str, Any]]:
         """The entries of its maps in store.json, sorted by path."""
-        return list(self._facts["maps"])
+        return self._maps.entries
 
     @property
-    def map_id(self) -> str:
-        """Short identifier, which changes when any of the maps does."""
-        return self._store_id
-
-    @property
-    def frame(self) -> None:  # type: ignore[override]
+    def frame(self) -> None:
         """None: every hit is in the frame of its map."""
 
     @property
-    def metric(self) -> None:  # type: ignore[override]
+    def metric(self) -> None:
         """None: every hit says whether its map is metric."""
 
     @property
     def counts(self) -> dict[str, int]:
-        return {"maps": len(self.maps), "instances": len(self._told)}
+        return {"maps": len(self.maps), "instances": len(self._maps.records)}
+
+    @property
+    def problem(self) -> str | None:
+        """As `QueryMap.problem`."""
+        try:
+            _ = self.ranker
+        except InputError as error:
+            return str(error)
+        return None
 
     def warm(self) -> None:
         if self.problem is None:
@@ -125,7 +120,7 @@ class MapStore(QueryMap):
     ) -> list[Hit]:
         """The instances that answer `text` in their own maps, best first, at most top_k, in the frames of their maps.
         `min_score`: all with this score instead. Raises InputError as `QueryMap.query`, and for `where` and `frame`."""
-        Request(text, top_k, min_score)
+        check_prompt(text, top_k, min_score)
         if where is not None or frame is not None:
             raise InputError(
                 f"{self.path}: is a store, whose maps have their own frames; give where and frame to a map"
@@ -133,8 +128,9 @@ class MapStore(QueryMap):
         return [self._hit(n, score) for n, score in self._chosen(text, min_score)[:top_k]]
 
     @cached_property
-    def ranker(self) -> Ranker:  # type: ignore[override]
-        name, identity = self._facts["encoder"]["name"], self._facts["encoder"]["identity"]
+    def ranker(self) -> Scorer:
+        """The scorer of all instances; InputError when the encoder cannot be made."""
+        name, identity = self._encoder["name"], self._encoder["identity"]
         try:
             encoder = (self.encoders or make_encoder)(name)
         except InputError as error:
@@ -142,10 +138,7 @@ class MapStore(QueryMap):
         if encoder is None:
             raise InputError(f"{self.path}: names no encoder; index its maps anew")
         check_encoder(identity, encoder.identity)
-        texts = [text for names in self._names for text in names["texts"] or [[]] * len(names["labels"])]
-        labels = [label for names in self._names for label in names["labels"]]
-        reads = np.array([names["texts"] is not None for names in self._names], bool)[self._groups]
-        return Ranker.joined(encoder, self._arrays, labels, Printed(texts, self._groups), reads)
+        return self._maps.scorer(TextEncoder(encoder))
 
     # --------------------------------------------------------------- internals
 
@@ -154,45 +147,45 @@ class MapStore(QueryMap):
         with torch_on_one_thread():
             scores = self._scores(text)
         best = np.zeros(len(self.maps))
-        np.maximum.at(best, self._groups, scores)
-        found = np.flatnonzero(scores >= (least_score(best)[self._groups] if min_score is None else min_score))
-        return [(int(n), float(scores[n])) for n in found[np.argsort(-scores[found], kind="stable")][:MAX_TOP]]
+        owner = self._maps.owner
+        np.maximum.at(best, owner, scores)
+        chosen = np.flatnonzero(scores >= (least_score(best)[owner] if min_score is None else min_score))
+        return [(int(n), float(scores[n])) for n in chosen[np.argsort(-scores[chosen], kind="stable")][:MAX_TOP]]
 
     def _scores(self, text: str) -> np.ndarray:
         """[I]: as `relations.ranked`, map by map: a map that has the text as a label takes it as a name."""
         scores, relation = self.ranker.scores(text), parse(text)
         if relation is None or quoted_text(text) is not None:
             return scores
-        named = [any(tidy(label or "") == tidy(text) for label in names["labels"]) for names in self._names]
         maps = [
-            (own, places)
-            for own, places, n in zip(self._slices, self._places_of, named, strict=True)
-            if not n and places
+            (own, boxes)
+            for own, boxes, names in zip(self._maps.slices, self._maps.boxes, self._maps.names, strict=True)
+            if boxes and all(tidy(label or "") != tidy(text) for label in names["labels"])
         ]
-        thing = self.ranker.scores(relation.thing, WEIGHT * standing(self.ranker, maps, relation))
+        thing = self.ranker.scores(relation.thing, WEIGHT * fulfilled(self.ranker, maps, relation))
         for own, _ in maps:
             scores[own] = thing[own]
         return scores
 
     def _hit(self, position: int, score: float) -> Hit:
-        told, n = self._told[position], int(self._groups[position])
-        entry, place = self.maps[n], position - self._slices[n].start
-        number = int(told["id"])
+        record, n = self._maps.records[position], int(self._maps.owner[position])
+        entry, row = self.maps[n], position - self._maps.slices[n].start
+        number = int(record["id"])
         return Hit(
             number,
             score,
             lambda: self._map(entry).index.of(number),  # type: ignore[arg-type]
-            told["centroid"],
-            OrientedBox(told["center"], told["rotation"], told["extent"]),
-            self._names[n]["labels"][place],
-            tuple(json.loads(self._photos[n].tobytes())[place]),
-            told["covariance"],
+            record["centroid"],
+            OrientedBox(record["center"], record["rotation"], record["extent"]),
+            self._maps.names[n]["labels"][row],
+            tuple(json.loads(self._maps.views[n].tobytes())[row]),
+            record["covariance"],
             entry["frame"],
-            colors=lambda: self._map(entry).colors_of(number),
+            colors=lambda: self._map(entry).get(number).colors(),  # type: ignore[misc,return-value]
             map=entry["map"],
             map_id=entry["map_id"],
             metric=entry["metric"],
-            count=int(told["points"]),
+            count=int(record["points"]),
         )
 
     def _map(self, entry: dict[str, Any]) -> QueryMap:
@@ -205,49 +198,66 @@ class MapStore(QueryMap):
             raise InputError(f"{path}: has changed since {self.path} was made; run: perception index MAP -o STORE")
         return gmap
 
-    def _read(self) -> None:
-        """Reads all arrays; those with a row per instance are put after each other."""
-        for entry in self.maps:  # before memory is taken for so many
-            file = self.path / "maps" / entry["file"]
-            if file.is_file() and entry["instances"] * TOLD.itemsize > file.stat().st_size:
-                found = f"maps: {file.name} is too small for its {entry['instances']} instances"
-                raise _damaged(self.path / STORE, ValueError(found))
-        counts = [entry["instances"] for entry in self.maps]
-        self._groups = np.repeat(np.arange(len(counts)), counts)
+
+class _Maps:
+    """The files of a store's maps. entries: of store.json. slices, boxes, names, views: of each map; owner [I]: the map
+    of each instance, and records [I] its `RECORD`; instances follow each other map by map."""
+
+    def __init__(self, path: Path, entries: list[dict[str, Any]]) -> None:
+        self.entries = entries
+        for entry in entries:  # before memory is taken for so many
+            file = path / "maps" / entry["file"]
+            if file.is_file() and entry["instances"] * RECORD.itemsize > file.stat().st_size:
+                problem = f"maps: {file.name} is too small for its {entry['instances']} instances"
+                raise _damaged(path / STORE, ValueError(problem))
+        counts = [entry["instances"] for entry in entries]
+        self.owner = np.repeat(np.arange(len(counts)), counts)
         stops = np.cumsum(counts).tolist()
-        self._slices = [slice(stop - count, stop) for stop, count in zip(stops, counts, strict=True)]
-        rows: dict[str, np.ndarray] = {}
+        self.slices = [slice(stop - count, stop) for stop, count in zip(stops, counts, strict=True)]
+        self._rows: dict[str, np.ndarray] = {}
         ragged: dict[str, list[Any]] = {name: [] for name in _RAGGED}
-        for own, entry in zip(self._slices, self.maps, strict=True):
-            file = self.path / "maps" / entry["file"]
+        for own, entry in zip(self.slices, entries, strict=True):
+            file = path / "maps" / entry["file"]
             arrays = read_npz(file, file, "index its map again")
             try:
-                for name, many in ragged.items():
-                    many.append(arrays.pop(name, None))
+                for name, of_maps in ragged.items():
+                    of_maps.append(arrays.pop(name, None))
                 for name, array in arrays.items():
                     if len(array) != entry["instances"]:
                         raise ValueError(f"{name}: {len(array)} rows, {STORE} says {entry['instances']} instances")
-                    if name not in rows:
-                        rows[name] = np.empty((sum(counts), *array.shape[1:]), array.dtype)
-                    rows[name][own] = array
+                    if name not in self._rows:
+                        self._rows[name] = np.empty((sum(counts), *array.shape[1:]), array.dtype)
+                    self._rows[name][own] = array
             except (ValueError, TypeError, KeyError) as error:
                 raise _damaged(file, error) from error
         try:
-            records = {name: rows.pop(name).view(kind)[:, 0] for name, kind in _RECORDS.items()}
-            self._told = records["told"]
-            labels = {name: np.concatenate(ragged[name]) for name in ("label_rows", "label_null")}
-            self._arrays = {**rows, **labels, "things": records["things"]}
-            self._names = [parsed(names.tobytes()) for names in ragged["names"]]
-            for names, count in zip(self._names, counts, strict=True):
+            self._things, self.records = (self._rows.pop(name).view(kind)[:, 0] for name, kind in _RECORDS.items())
+            self._label_rows, self._label_null = (np.concatenate(ragged[name]) for name in ("label_rows", "label_null"))
+            self.names = [parsed(names.tobytes()) for names in ragged["names"]]
+            for names, count in zip(self.names, counts, strict=True):
                 check(NAMES, names)
                 if not len(names["labels"]) == count == len(names["texts"] or names["labels"]):
                     raise ValueError(f"names: expected those of {count} instances")
         except (ValueError, TypeError, KeyError, AttributeError) as error:
-            raise _damaged(self.path / STORE, error) from error
-        self._photos, poses = ragged["views"], ragged["poses"]
-        self._places_of = [
-            p if p is None else Places(p[:, 0], p[:, 1], c) for p, c in zip(ragged["places"], poses, strict=True)
+            raise _damaged(path / STORE, error) from error
+        self.views, poses = ragged["views"], ragged["poses"]
+        self.boxes = [
+            p if p is None else LevelBoxes(p[:, 0], p[:, 1], c) for p, c in zip(ragged["places"], poses, strict=True)
         ]
+
+    def scorer(self, encoder: TextEncoder) -> Scorer:
+        """Of all instances, each with the scores that it has in its own map."""
+        texts = [text for names in self.names for text in names["texts"] or [[]] * len(names["labels"])]
+        prepared = Prepared(
+            **{name: self._things[name] for name in ("seen", "null", "colors", "sides")},
+            plain=self._rows["plain"],
+            compared=[self._rows[f"part_{n}"] for n in range(len(encoder.parts))],
+            labels=[label for names in self.names for label in names["labels"]],
+            label_rows=self._label_rows,
+            label_null=self._label_null,
+        )
+        reads = np.array([names["texts"] is not None for names in self.names], bool)[self.owner]
+        return Scorer(encoder, prepared, lambda: self._things["shapes"], Printed(texts, self.owner), reads)
 
 
 def read_store(path: Path) -> tuple[dict[str, Any], bytes]:

@@ -19,15 +19,15 @@ PLAIN_WORDS = (
 
 def likely_names(ranker: Ranker, count: int = 3) -> list[list[str]]:
     """The `count` most likely names of each instance, best first; empty for an instance that no photo shows."""
-    words = vocabulary()
-    relevancy = ranker.relevancy(words)
+    nouns = vocabulary()
+    relevancy = ranker.relevancy(nouns)
     shapes = ranker.shapes
     names: list[list[str]] = []
     for i, row in enumerate(relevancy.T):
         if not ranker.seen[i]:
             names.append([])
             continue
-        ranked = [words[n] for n in np.argsort(-row, kind="stable")[: count + 1]]
+        ranked = [nouns[n] for n in np.argsort(-row, kind="stable")[: count + 1]]
         if shapes is not None:
             ranked = [kind for k, kind in enumerate(KINDS) if kind not in HINTS and shapes[i, k] >= SURE] + ranked
         names.append(list(dict.fromkeys(ranked))[:count])

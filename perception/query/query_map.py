@@ -2,38 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from functools import cached_property, partial
-from pathlib import Path
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from perception.errors import InputError
-from perception.geometry import move_points
-from perception.map.checksums import STORE
+from perception.geometry import move_points, scale_of
 from perception.map.map import Map
 from perception.query.hit import Description, Hit, Neighbor
-from perception.query.nodes import Nodes
+from perception.query.instance_set import InstanceSet
+from perception.query.naming import likely_names
+from perception.query.nodes import Candidate, Node, Nodes
 from perception.query.ranking import Ranker, answering
-from perception.query.requests import TOP, Request, UnknownInstance
+from perception.query.requests import TOP, UnknownInstance, check_prompt
 from perception.query.spatial_index import SpatialIndex
 from perception.query.text_ranking import Encoders, TextRanking
-from perception.query.where import Frame, Where, place, tidy
+from perception.query.where import Frame, Where, position_of, tidy
 from perception.types import OrientedBox, View
 
 if TYPE_CHECKING:
-    from perception.query.standing import FreeSpace
+    from perception.query.free_space import FreeSpace
 
 _NEIGHBORS = 3
 _LEAST_COLOR = 0.05
 
 
+@dataclass(eq=False, repr=False)
 class QueryMap(Map):
     """A `Map` with queries. Thread-safe.
 
     Data is loaded on first use: embeddings and encoder at the first prompt. The map's folder may be replaced meanwhile:
-    this object keeps the map that it opened.
+    this object keeps the map that it opened. encoders: makes an encoder from its name in the map's config;
+    perception.language.encoders.make_encoder when None.
 
     A method with `frame` takes and returns points, poses, boxes and lengths in that frame. Without it, they are in the
     map's own frame (`frame`), in metres when `metric`. Methods raise InputError for bad arguments and damaged files.
@@ -47,7 +49,6 @@ class QueryMap(Map):
     """
 
     encoders: Encoders | None = None
-    """Makes an encoder from its name in the map's config; perception.language.make_encoder when None."""
 
     @property
     def problem(self) -> str | None:
@@ -86,74 +87,71 @@ class QueryMap(Map):
         where: Where | None = None,
         frame: Frame | None = None,
     ) -> list[Hit]:
-        """The instances that answer `text` (`language.ranking.answering`), best first, none, one or up to top_k.
+        """The instances that answer `text` (`ranking.answering`), best first, none, one or up to top_k.
 
         A part of an instance, or a group of them, is answered where it fits clearly better (see `Hit`). `min_score`:
         the instances with at least this score instead. `where` keeps only instances that fulfil it, and those
         that answer are then decided among these. Raises InputError for an empty or overlong text, and
         for a map without embeddings or whose encoder is not installed.
         """
-        Request(text, top_k, min_score)
+        check_prompt(text, top_k, min_score)
         if not self.instances:
             return []
-        chosen, wanted = self._ranking.rank(text).hits, (where or Where()).in_map(frame)
+        ranked, wanted = self._ranking.rank(text).hits, (where or Where()).in_map(frame)
+        chosen: list[Candidate] = list(ranked)
         if where is not None:
             allowed = set(self._fulfilling(wanted))
-            chosen = [(n, s) for n, s in chosen if n in allowed]
+            chosen = [(n, score) for n, score in ranked if n in allowed]
         elif min_score is None:
-            chosen = self._nodes.fitting(text, chosen)
-        chosen = answering(chosen, min_score)[:top_k]
-        return [self._in(frame, self._measured(n, wanted, s)) for n, s in chosen]
+            chosen = self._nodes.fitting(text, ranked)
+        hits = [
+            candidate.hit(score) if isinstance(candidate, Node) else self._measured(candidate, wanted, score)
+            for candidate, score in answering(chosen, min_score)[:top_k]
+        ]
+        return [_in(frame, hit) for hit in hits]
 
     def find(self, where: Where | None = None, *, frame: Frame | None = None) -> list[Hit]:
         """All instances that fulfil `where`, in the order of instances.json, scored by the mapper's confidence."""
         wanted = (where or Where()).in_map(frame)
-        return [self._in(frame, self._measured(n, wanted)) for n in self._fulfilling(wanted)]
+        return [_in(frame, self._measured(n, wanted)) for n in self._fulfilling(wanted)]
 
     def in_box(self, box: OrientedBox, *, share: float = 0.5, frame: Frame | None = None) -> list[Hit]:
-        """The instances with at least `share` of their points in `box` (see `axis_box` for a box along the axes)."""
+        """The instances with at least `share` of their points in `box` (`axis_box`: a box along the axes)."""
         return self.find(Where(region=box, share=share), frame=frame)
 
     def nearest(
-        self,
-        near: np.ndarray,
-        top_k: int = 1,
-        *,
-        where: Where | None = None,
-        frame: Frame | None = None,
+        self, near: np.ndarray, top_k: int = 1, *, where: Where | None = None, frame: Frame | None = None
     ) -> list[Hit]:
         """The top_k instances nearest to a point [3] or a pose [4, 4] by their nearest point, nearest first, each hit
         with its `distance`. `where` keeps only instances that fulfil it. Raises InputError for top_k below 1."""
         if top_k < 1:
             raise InputError(f"nearest: top_k is {top_k}, expected at least 1")
         wanted = (where or Where()).in_map(frame)
-        point = place(near) if frame is None else move_points(frame.to_map, place(near))
-        ids = {self._id(n): n for n in self._fulfilling(wanted)}
-        found = self._spatial.nearest(point, top_k, ids)
-        return [self._in(frame, self._measured(ids[i], Where(near=point))) for _, i in found]
+        point = _in_map(near, frame)
+        ids = [int(self.instances[n]["id"]) for n in self._fulfilling(wanted)]
+        nearest = self._spatial.nearest(point, top_k, ids)
+        return [_in(frame, replace(self.hit(self.position(i)), distance=distance)) for distance, i in nearest]
 
     def instance_at(
         self, point: np.ndarray, *, max_distance: float | None = None, frame: Frame | None = None
     ) -> Hit | None:
         """The instance that `point` [3] lies on: the one with the nearest point, if that is at most `max_distance`
         away; when None, no farther than the spacing of the instance's points there (see `SpatialIndex.reaches`)."""
-        hits = self.nearest(place(point), 1, frame=frame)
-        if not hits or hits[0].distance is None:
-            return None
-        if max_distance is not None:
-            return hits[0] if hits[0].distance <= max_distance else None
-        spot = place(point) if frame is None else move_points(frame.to_map, place(point))
-        return hits[0] if self._spatial.reaches(hits[0].instance_id, spot) else None
+        for hit in self.nearest(point, 1, frame=frame):
+            if max_distance is not None and hit.distance is not None:
+                return hit if hit.distance <= max_distance else None
+            return hit if self._spatial.reaches(hit.instance_id, _in_map(point, frame)) else None
+        return None
 
     def get(self, instance_id: int, *, frame: Frame | None = None) -> Hit:
         """The instance with this id; InputError when there is none."""
-        return self._in(frame, self.hit(self.position(instance_id)))
+        return _in(frame, self.hit(self.position(instance_id)))
 
     def describe(self, instance_id: int, *, frame: Frame | None = None) -> Description:
         """The properties of an instance: its hit, colours, bounds and the three nearest instances."""
         position = self.position(instance_id)
-        hit = self._in(frame, self.hit(position))
-        scale = 1.0 if frame is None else float(np.cbrt(np.linalg.det(frame.from_map[:3, :3])))
+        hit = _in(frame, self.hit(position))
+        scale = 1.0 if frame is None else scale_of(frame.from_map)
         beside = self._spatial.neighbors(instance_id, _NEIGHBORS)
         labels = {entry["id"]: entry.get("label") for entry in self.instances}
         bounds = np.array([hit.points.min(axis=0), hit.points.max(axis=0)] if len(hit.points) else np.full((2, 3), 0.0))
@@ -167,46 +165,26 @@ class QueryMap(Map):
 
     def likely_names(self, count: int = 3) -> list[list[str]]:
         """The likeliest names of every instance, best first, in the order of `instances`."""
-        from perception.query.naming import likely_names
-
         return likely_names(self.ranker, count) if self.instances else []
 
     def hit(self, position: int, score: float | None = None) -> Hit:
         """Entry `position` of instances.json as a Hit; score: the mapper's confidence when None."""
-        entry = self.instances[position]
-        box = entry["obb"]
-        points = self.index.of(entry["id"])
-        return Hit(
-            int(entry["id"]),
-            float(entry["score"]) if score is None else score,
-            points,
-            np.array(entry["centroid"], np.float64),
-            OrientedBox(np.array(box["center"]), np.array(box["rotation"]), np.array(box["extent"])),
-            entry.get("label"),
-            self._views(position),
-            self._covariance(position),
-            self.frame,
-            colors=partial(self.colors_of, int(entry["id"])),
-        )
+        return self._wholes.hit(position, score)
 
     def position(self, instance_id: int) -> int:
         """The index of this id in instances.json; UnknownInstance when there is none."""
-        place = self._places.get(instance_id)
-        if place is None:
+        position = self._positions.get(instance_id)
+        if position is None:
             raise UnknownInstance(f"instance {instance_id}: the map has none such; it has {len(self.instances)}")
-        return place
+        return position
 
     def best_view(self, instance_id: int) -> tuple[View, tuple[int, int, int, int]] | None:
         """The view that shows the instance best and the tight box (x0, y0, x1, y1) in it, in pixels of the size used
         for training; None when none shows it. InputError for an unknown id."""
         position = self.position(instance_id)
-        names = self._views(position)
+        names = self._wholes.views(position)
         view = next((view for view in self.views if view.name in names[:1]), None)
-        if view is None:
-            return None
-        start = int(self._view_stops[position]) - len(names)
-        x0, y0, x1, y1 = (int(value) for value in self.language["view_boxes"][start])
-        return view, (x0, y0, x1, y1)
+        return None if view is None else (view, self._wholes.best_box(position))
 
     # --------------------------------------------------------------- internals
 
@@ -228,45 +206,11 @@ class QueryMap(Map):
         return where.within is None or self._spatial.distance(entry["id"], np.asarray(where.near)) <= where.within
 
     def _measured(self, position: int, where: Where, score: float | None = None) -> Hit:
-        """A Hit, with its distance if `where.near` is given; positions after the instances are parts and groups."""
-        beyond = position - len(self.instances)
-        hit = self.hit(position, score) if beyond < 0 else self._nodes.hit(beyond, score or 0.0)
+        """A Hit, with its distance if `where.near` is given."""
+        hit = self.hit(position, score)
         if where.near is None:
             return hit
         return replace(hit, distance=self._spatial.distance(hit.instance_id, np.asarray(where.near)))
-
-    def _in(self, frame: Frame | None, hit: Hit) -> Hit:
-        return hit if frame is None else hit.transformed(frame.from_map, frame.name)
-
-    def _id(self, position: int) -> int:
-        return int(self.instances[position]["id"])
-
-    @cached_property
-    def _places(self) -> dict[int, int]:
-        return {int(entry["id"]): n for n, entry in enumerate(self.instances)}
-
-    def _views(self, position: int) -> tuple[str, ...]:
-        language = self.language
-        if not language:
-            return ()
-        stop = int(self._view_stops[position])
-        names = language["view_names"][stop - int(language["view_counts"][position]) : stop]
-        return tuple(str(name) for name in names)
-
-    @cached_property
-    def _view_stops(self) -> np.ndarray:
-        """[I] int64: one past the last row of each instance's views."""
-        return np.cumsum(self.language["view_counts"], dtype=np.int64)
-
-    def _covariance(self, position: int) -> np.ndarray:
-        """[3, 3] of the instance's points, computed once."""
-        if position not in self._covariances:
-            points = self.index.of(self._id(position)).astype(np.float64)
-            centred = points - points.mean(axis=0) if len(points) else points
-            covariance = centred.T @ centred / max(len(points), 1)
-            covariance.setflags(write=False)
-            self._covariances[position] = covariance
-        return self._covariances[position]
 
     def _colors(self, position: int) -> tuple[tuple[str, float], ...]:
         """Names of the instance's colours and their shares, from 5 % up, largest first."""
@@ -279,8 +223,12 @@ class QueryMap(Map):
         return tuple(sorted((entry for entry in shares if entry[1] >= _LEAST_COLOR), key=lambda entry: -entry[1]))
 
     @cached_property
-    def _covariances(self) -> dict[int, np.ndarray]:
-        return {}
+    def _positions(self) -> dict[int, int]:
+        return {int(entry["id"]): n for n, entry in enumerate(self.instances)}
+
+    @cached_property
+    def _wholes(self) -> InstanceSet:
+        return InstanceSet(self, self.instances, self.language)
 
     @cached_property
     def _ranking(self) -> TextRanking:
@@ -288,12 +236,12 @@ class QueryMap(Map):
 
     @cached_property
     def _nodes(self) -> Nodes:
-        return Nodes(self)
+        return Nodes(self, lambda: self.ranker)
 
     @cached_property
     def free_space(self) -> FreeSpace:
-        """Where a robot can stand (`standing.where_to_stand`); InputError as `floor_grid`."""
-        from perception.query.standing import FreeSpace
+        """Where a robot can be (`robot_pose.where_to_stand`); InputError as `floor_grid`."""
+        from perception.query.free_space import FreeSpace
 
         return FreeSpace(self)
 
@@ -302,20 +250,12 @@ class QueryMap(Map):
         return SpatialIndex(self.index)
 
 
-def load_map(path: str | Path, encoders: Encoders | None = None) -> QueryMap:
-    """Opens a map directory, a million Gaussians in well under a second, or a store of many maps (`MapStore`).
+def _in(frame: Frame | None, hit: Hit) -> Hit:
+    """A hit of the map in `frame`; None: in the map's own."""
+    return hit if frame is None else hit.transformed(frame.from_map, frame.name)
 
-    encoders: makes an encoder from its name in the map's config; perception.language.encoders.make_encoder when None.
-    Raises InputError when `path` is neither, damaged, or of another format version.
 
-    >>> gmap = load_map("kitchen.gsmap")
-    >>> gmap.counts
-    {'instances': 9, 'gaussians': 3000}
-    >>> gmap.query("red mug", top_k=3)[0].points.shape[1]
-    3
-    """
-    from perception.query.map_store import MapStore
-
-    gmap = (MapStore if (Path(path) / STORE).is_file() else QueryMap).open(Path(path))
-    gmap.encoders = encoders
-    return gmap
+def _in_map(point_or_pose: np.ndarray, frame: Frame | None) -> np.ndarray:
+    """The position [3] of a point or pose in `frame`, in the map's frame."""
+    position = position_of(point_or_pose)
+    return position if frame is None else move_points(frame.to_map, position)

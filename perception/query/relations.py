@@ -1,9 +1,12 @@
-"""Prompts about place: "the mug on the book", "the box left of the lamp". English only.
+"""Prompts with a relation: "the mug on the book", "the box left of the lamp". English only.
 
-The thing is ranked by its own words, and each instance gains by how well it stands in the relation to what the other
-words mean:  z_i + WEIGHT · max over present j ≠ i of score(other, j) · g(i, j),  g in [0, 1] from the boxes of i and j
-with z up. "Left", "right", "in front" and "behind" are as most photos that show both see them. If the other thing is
-not in the map, no instance gains. The other words may hold a relation too: "the cup on the desk next to the monitor".
+Such a prompt names a thing, a relation and another thing. Instances i are ranked for the thing, with the gain
+
+    z_i + WEIGHT · f_i      f_i = max over j ≠ i of score(other, j) · f_j · g(i, j)
+
+where g(i, j) in [0, 1] says how well the boxes of i and j, with z up, are in the relation, and f_j does the same for a
+relation in the name of the other thing ("the cup on the desk next to the monitor"), else 1. "Left", "right", "in front"
+and "behind" are as most photos that show both see them. If the other thing is not in the map, no instance gains.
 """
 
 from __future__ import annotations
@@ -11,21 +14,18 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from perception.frame.gravity import up_from_cameras
 from perception.language.printed import found_after_a_word, quoted_text
-from perception.query.ranking import PRESENT
-from perception.query.shapes import ramp
-
-if TYPE_CHECKING:
-    from perception.map.map import Map
-    from perception.query.ranking import Answer, Ranker
+from perception.map.map import Map
+from perception.query.ranking import PRESENT, Answer, Scorer
+from perception.query.shapes import level_frame, ramp
 
 TRIM = 0.02  # share of an instance's points left out of its box at either end of each axis
 WEIGHT = 3.0  # added to z for a full match, in standard deviations of the map's probes
-NESTED = 3  # relations that are read in what a thing stands in relation to; each costs as much as a prompt
+NESTED = 3  # relations that are read in the name of the other thing; each costs as much as a prompt
 _RELATION = re.compile(  # in a text of single spaces, so that every repeat has an end
     r"(?<= )(?:(?:that|which) )?(?:(?:is|are|stand|sit|lie|hang|lean)(?:s|ing)? )?(?:to the )?"
     r"(?P<relation>on top of|on|upon|under|underneath|beneath|below|above|over|next to|beside|near|close to|by|inside|"
@@ -43,13 +43,13 @@ _KINDS = {
     "front": ("in front of",),
     "behind": ("behind",),
 }
-_KIND = {words: kind for kind, group in _KINDS.items() for words in group}
+_KIND = {phrase: kind for kind, phrases in _KINDS.items() for phrase in phrases}
 _DETAIL = re.compile(r"\b(?:with|of|full|made|without)\b", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
 class Relation:
-    """thing stands in the relation `kind`, a key of _KINDS, to other."""
+    """thing is in the relation `kind`, a key of _KINDS, to other."""
 
     thing: str
     kind: str
@@ -62,50 +62,50 @@ def parse(prompt: str) -> Relation | None:
     What follows "with" or "of" describes the thing itself: "magazine with a shell on the cover" has no relation.
     """
     text = " ".join(prompt.split())
-    found = found_after_a_word(_RELATION, text)
-    kind = None if found is None else _KIND.get(found["relation"].lower())  # None too for "İn", as i without its case
-    if found is None or kind is None or _DETAIL.search(text, 0, found.start()):
+    match = found_after_a_word(_RELATION, text)
+    kind = None if match is None else _KIND.get(match["relation"].lower())  # None too for "İn", as i without its case
+    if match is None or kind is None or _DETAIL.search(text, 0, match.start()):
         return None
-    return Relation(text[: found.start() - 1], kind, text[found.end() :])
+    return Relation(text[: match.start() - 1], kind, text[match.end() :])
 
 
-def ranked(ranker: Ranker, places: Places | None, text: str) -> Answer:
+def ranked(ranker: Scorer, boxes: LevelBoxes | None, text: str) -> Answer:
     """The ranking of the instances for a prompt, by the relation in it if there is one and z is known."""
     relation = parse(text)
-    if relation is None or places is None or quoted_text(text) is not None:
+    if relation is None or boxes is None or quoted_text(text) is not None:
         return ranker.rank(text)
-    gain = WEIGHT * standing(ranker, [(slice(None), places)], relation)
+    gain = WEIGHT * fulfilled(ranker, [(slice(None), boxes)], relation)
     return replace(ranker.rank(relation.thing, gain), text=" ".join(text.split()))
 
 
-def standing(
-    ranker: Ranker, maps: Sequence[tuple[slice, Places]], relation: Relation, nested_most: int = NESTED
+def fulfilled(
+    ranker: Scorer, maps: Sequence[tuple[slice, LevelBoxes]], relation: Relation, nested_most: int = NESTED
 ) -> np.ndarray:
-    """[I] in [0, 1]: how well each instance stands in the relation to what its other words mean, "the desk next to the
-    monitor" for one. maps: of each map whose places are known, its slice of the ranker's instances, and the places.
-    nested_most: relations that are read in the other words; further ones are taken as part of a name."""
+    """f [I] in [0, 1]: how well each instance is in the relation to the other thing.
+
+    maps: of each map whose boxes are known, its slice of the ranker's instances, and the boxes. nested_most: relations
+    that are read in the name of the other thing; further ones are taken as part of a name.
+    """
     nested = parse(relation.other) if nested_most else None
     score = ranker.scores(relation.other if nested is None else nested.thing)
-    further = np.ones(len(score)) if nested is None else standing(ranker, maps, nested, nested_most - 1)
-    found = np.zeros(len(score))
-    for own, places in maps:
+    further = np.ones(len(score)) if nested is None else fulfilled(ranker, maps, nested, nested_most - 1)
+    best = np.zeros(len(score))
+    for own, boxes in maps:
         if score[own].max(initial=0.0) >= PRESENT:
             others = score[own] * further[own]
-            found[own] = (places.match(relation.kind) * others[None]).max(axis=1, initial=0.0)
-    return found
+            best[own] = (boxes.match(relation.kind) * others[None]).max(axis=1, initial=0.0)
+    return best
 
 
 def level_from_map(gmap: Map) -> np.ndarray | None:
     """The rotation [3, 3] to a frame with z up: against the map's gravity or, where that is not recorded, up as the
     cameras were held; None if they were not held level."""
-    from perception.query.shapes import level_frame, up_from_cameras
-
     down = (gmap.info.get("gravity") or {}).get("direction")
     up = up_from_cameras(gmap.poses) if down is None else -np.asarray(down, np.float64)
     return None if up is None else level_frame(up / np.linalg.norm(up))
 
 
-class Places:
+class LevelBoxes:
     """lows, highs: [I, 3] corners of the instances' boxes, z up. poses: [C, 4, 4] cameras from that frame."""
 
     def __init__(self, lows: np.ndarray, highs: np.ndarray, poses: np.ndarray) -> None:
@@ -113,8 +113,8 @@ class Places:
         self.poses = poses
 
     @classmethod
-    def of(cls, gmap: Map) -> Places | None:
-        """The places in a map; None if up is not known (`level_from_map`)."""
+    def of(cls, gmap: Map) -> LevelBoxes | None:
+        """The boxes of a map's instances; None if up is not known (`level_from_map`)."""
         level = level_from_map(gmap)
         if level is None:
             return None
@@ -128,7 +128,7 @@ class Places:
         return cls(boxes[:, 0], boxes[:, 1], poses)
 
     def match(self, kind: str) -> np.ndarray:
-        """g [I, I] in [0, 1]: how well the row's instance stands in the relation to the column's; 0 to itself."""
+        """g [I, I] in [0, 1]: how well the row's instance is in the relation to the column's; 0 to itself."""
         return self._match(kind) * (1 - np.eye(len(self.lows)))
 
     def _match(self, kind: str) -> np.ndarray:

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from perception.errors import InputError
 from perception.io.atomic import atomic_file
-from perception.query.relations import Places, level_from_map
+from perception.query.relations import LevelBoxes, level_from_map
 
 if TYPE_CHECKING:
     import networkx
@@ -35,7 +35,7 @@ RING = 0.4  # width of the ring, as a share of the foot's shorter side
 FLAT = 0.15  # most thickness of what hangs on a wall, as a share of its size
 TOUCHING = 0.05  # least share of the points of what is attached that touch what holds it
 HIDDEN = 0.5  # share of a thing's height, at its foot, that no photo may have seen
-MATCH = 0.5  # least match of `Places` for "in" and "next to"
+MATCH = 0.5  # least match of `LevelBoxes` for "in" and "next to"
 DOOR = 1.2  # metres: narrower passages part two rooms
 
 
@@ -62,14 +62,15 @@ def scene_graph(gmap: Map) -> networkx.DiGraph:
     """
     import networkx
 
-    places, level = Places.of(gmap), level_from_map(gmap)
-    if places is None or level is None:
+    boxes, level = LevelBoxes.of(gmap), level_from_map(gmap)
+    if boxes is None or level is None:
         advice = "map photos of a level camera, or a transforms.json with 'gravity'"
         raise InputError(f"{gmap.path}: which way is up is not known, and a scene graph needs it; {advice}")
-    points = [_thinned(gmap.index.of(entry["id"])) @ level.T for entry in gmap.instances]
-    held = holders(points, places)
-    beside, rooms = places.match("beside"), _rooms(gmap)
-    shell = _shells(places)
+    clouds = [gmap.index.of(entry["id"]) for entry in gmap.instances]
+    points = [cloud[:: -(-len(cloud) // MOST_POINTS) or 1].astype(np.float64) @ level.T for cloud in clouds]
+    held = holders(points, boxes)
+    beside, rooms = boxes.match("beside"), _rooms(gmap)
+    shell = _shells(boxes)
     ids = [int(entry["id"]) for entry in gmap.instances]
     graph = networkx.DiGraph(frame=gmap.frame, metric=gmap.metric, map_id=gmap.map_id)
     supports = {holder.position for holder in held if holder is not None and holder.relation == "on"}
@@ -84,50 +85,49 @@ def scene_graph(gmap: Map) -> networkx.DiGraph:
     for n, holder in enumerate(held):
         if holder is not None:
             graph.add_edge(ids[n], ids[holder.position], relation=holder.relation, score=round(holder.score, 3))
+        room = f"room {rooms[n]}"
         if holder is None or shell[holder.position]:
-            room = f"room {rooms[n]}"
             graph.add_node(room, kind="room")
-            if holder is None:
-                graph.add_edge(ids[n], room, relation="in", score=1.0)
-            else:
-                graph.nodes[ids[n]]["room"] = room
+        if holder is None:
+            graph.add_edge(ids[n], room, relation="in", score=1.0)
+        elif shell[holder.position]:
+            graph.nodes[ids[n]]["room"] = room
+    on = [None if holder is None else holder.position for holder in held]
     for a, b in zip(*np.nonzero(np.triu(beside >= MATCH)), strict=True):
-        one, other = held[a], held[b]
-        together = one is not None and other is not None and one.position == other.position
-        if together and not graph.has_edge(ids[a], ids[b]) and not graph.has_edge(ids[b], ids[a]):
-            for i, j in ((a, b), (b, a)):
-                graph.add_edge(ids[i], ids[j], relation="next to", score=round(float(beside[a, b]), 3))
+        apart = not graph.has_edge(ids[a], ids[b]) and not graph.has_edge(ids[b], ids[a])
+        for i, j in ((a, b), (b, a)) if apart and on[a] is not None and on[a] == on[b] else ():
+            graph.add_edge(ids[i], ids[j], relation="next to", score=round(float(beside[a, b]), 3))
     return graph
 
 
-def holders(points: list[np.ndarray], places: Places) -> list[Holder | None]:
+def holders(points: list[np.ndarray], boxes: LevelBoxes) -> list[Holder | None]:
     """What holds each instance; None where nothing does. points: of the instances, [P, 3] each, z up."""
-    shell, sizes, inside = _shells(places), places.highs - places.lows, places.match("in")
+    shell, sizes, inside = _shells(boxes), boxes.highs - boxes.lows, boxes.match("in")
     typical = float(np.median(sizes[~shell].max(axis=1))) if (~shell).any() else 0.0
     trees = {j: cKDTree(cloud) for j, cloud in enumerate(points) if len(cloud)}
-    found: list[Holder | None] = []
+    held: list[Holder | None] = []
     for n, mine in enumerate(points):
         slack = 0.02 * typical + min(0.25 * sizes[n, 2], 0.1 * typical)
-        found.append(None if shell[n] or len(mine) == 0 else _holder(n, points, trees, places, shell, inside[n], slack))
-    for n, holder in enumerate(found):  # of two things that hold each other, the lower one stands by itself
-        other = None if holder is None else found[holder.position]
+        held.append(None if shell[n] or len(mine) == 0 else _holder(n, points, trees, boxes, shell, inside[n], slack))
+    for n, holder in enumerate(held):  # of two things that hold each other, nothing holds the lower one
+        other = None if holder is None else held[holder.position]
         if holder is not None and other is not None and other.position == n:
-            found[n if places.lows[n, 2] <= places.lows[holder.position, 2] else holder.position] = None
-    return found
+            held[n if boxes.lows[n, 2] <= boxes.lows[holder.position, 2] else holder.position] = None
+    return held
 
 
 def _holder(
     n: int,
     points: list[np.ndarray],
     trees: dict[int, cKDTree],
-    places: Places,
+    boxes: LevelBoxes,
     shell: np.ndarray,
     inside: np.ndarray,
     slack: float,
 ) -> Holder | None:
-    mine, low, size = points[n], places.lows[n], places.highs[n] - places.lows[n]
+    mine, low, size = points[n], boxes.lows[n], boxes.highs[n] - boxes.lows[n]
     others = [j for j in range(len(points)) if j != n and len(points[j])]
-    middle = (places.lows[n] + places.highs[n])[:2] / 2
+    middle = (boxes.lows[n] + boxes.highs[n])[:2] / 2
 
     def around(xy: np.ndarray) -> float:
         """Share of the directions from the thing in which there are such points."""
@@ -143,18 +143,18 @@ def _holder(
         if not shell[j] and not flat and around(walls[:, :2]) >= LEAST_WALLS:
             return Holder(int(j), "in", float(inside[j]))
     reach = 2 * slack + float(size.min())
-    away = np.maximum(places.lows - places.highs[n], places.lows[n] - places.highs).max(axis=1)
+    away = np.maximum(boxes.lows - boxes.highs[n], boxes.lows[n] - boxes.highs).max(axis=1)
     near = {j: trees[j].query(mine, distance_upper_bound=reach)[0] for j in others if away[j] <= 2 * reach}
     touches = {j: float(np.isfinite(near[j]).mean()) if j in near else 0.0 for j in others}
     flat = size[:2].min() < FLAT * size.max()
-    upright = [j for j in others if shell[j] and places.highs[j, 2] - places.lows[j, 2] > size[2]]
+    upright = [j for j in others if shell[j] and boxes.highs[j, 2] - boxes.lows[j, 2] > size[2]]
     wall = max(upright, key=lambda j: touches[j], default=None)
     if flat and wall is not None and touches[wall] >= TOUCHING:
         return Holder(wall, "attached to", touches[wall])
     foot = mine[mine[:, 2] <= low[2] + slack + 0.1 * size[2]][:, :2]
     tree, width = cKDTree(foot if len(foot) else mine[:, :2]), max(RING * float(size[:2].min()), 3 * slack)
-    over = (places.lows[:, :2] <= middle).all(axis=1) & (middle <= places.highs[:, :2]).all(axis=1)
-    spans = places.highs - places.lows
+    over = (boxes.lows[:, :2] <= middle).all(axis=1) & (middle <= boxes.highs[:, :2]).all(axis=1)
+    spans = boxes.highs - boxes.lows
     floors = shell & (spans[:, 2] < 0.5 * spans[:, :2].min(axis=1))
     under = [j for j in others if floors[j] or (over[j] and not shell[j])]
     for wide in (width, 3 * width):  # of a corner behind furniture little floor is seen
@@ -163,9 +163,8 @@ def _holder(
             near = points[j][points[j][:, 2] >= low[2] - max(3 * slack, HIDDEN * size[2])]
             near = near[np.isfinite(tree.query(near[:, :2], distance_upper_bound=wide)[0])] if len(near) else near
             below = near[near[:, 2] <= low[2] + slack]
-            if (
-                len(below) and (share := around(below[:, :2])) >= LEAST_RING
-            ):  # a neighbour stands higher beside the thing
+            share = around(below[:, :2])
+            if share >= LEAST_RING:  # a neighbour is higher beside the thing
                 tops.append((float(np.quantile(below[:, 2], 0.9)), share * len(below) / len(near), j))
         if tops:
             best_score = max(score for _, score, _ in tops)
@@ -174,21 +173,16 @@ def _holder(
     best = max(others, key=lambda j: touches[j], default=None)
     if best is not None and touches[best] >= TOUCHING:
         return Holder(best, "attached to", touches[best])
-    flats = [j for j in under if floors[j] and low[2] - size[2] <= places.highs[j, 2] <= low[2] + slack]
-    return Holder(max(flats, key=lambda j: places.highs[j, 2]), "on", 1 / SECTORS) if flats else None
+    flats = [j for j in under if floors[j] and low[2] - size[2] <= boxes.highs[j, 2] <= low[2] + slack]
+    return Holder(max(flats, key=lambda j: boxes.highs[j, 2]), "on", 1 / SECTORS) if flats else None
 
 
-def _thinned(points: np.ndarray) -> np.ndarray:
-    """At most MOST_POINTS, evenly chosen, float64."""
-    return np.asarray(points[:: -(-len(points) // MOST_POINTS) or 1], np.float64)
-
-
-def _shells(places: Places) -> np.ndarray:
+def _shells(boxes: LevelBoxes) -> np.ndarray:
     """[I] bool: the instances as large as the map along two axes: walls, floors, ceilings."""
-    if len(places.lows) == 0:
+    if len(boxes.lows) == 0:
         return np.zeros(0, bool)
-    extent = np.maximum(places.highs.max(axis=0) - places.lows.min(axis=0), 1e-9)
-    return np.asarray(((places.highs - places.lows) >= SHELL * extent).sum(axis=1) >= 2)
+    extent = np.maximum(boxes.highs.max(axis=0) - boxes.lows.min(axis=0), 1e-9)
+    return np.asarray(((boxes.highs - boxes.lows) >= SHELL * extent).sum(axis=1) >= 2)
 
 
 def _rooms(gmap: Map) -> list[int]:
@@ -223,5 +217,5 @@ def write_graph(gmap: Map, path: Path) -> tuple[dict[str, Any], str]:
         aside.write_text(json.dumps(networkx.node_link_data(graph, edges="edges"), indent=1), encoding="utf-8")
     kinds = Counter(kind for _, kind in graph.nodes(data="kind"))
     relations = Counter(relation for _, _, relation in graph.edges(data="relation"))
-    told = ", ".join(f"{count} {name}" for name, count in (*sorted(kinds.items()), *sorted(relations.items())))
-    return {"path": str(path), "nodes": dict(kinds), "edges": dict(relations)}, f"{path}: {told}"
+    counts = ", ".join(f"{count} {name}" for name, count in (*sorted(kinds.items()), *sorted(relations.items())))
+    return {"path": str(path), "nodes": dict(kinds), "edges": dict(relations)}, f"{path}: {counts}"

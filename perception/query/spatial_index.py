@@ -22,11 +22,11 @@ class SpatialIndex:
         self.index = index
         bounds = [(points.min(axis=0), points.max(axis=0)) for points in map(index.of, index.ids)]
         self.bounds = np.array(bounds, np.float64).reshape(-1, 2, 3)
-        self._place = {int(i): n for n, i in enumerate(index.ids)}
+        self._row = {int(i): n for n, i in enumerate(index.ids)}
 
     def aabb(self, instance_id: int) -> np.ndarray:
         """[2, 3] lowest and highest corner of the instance's points; NaN without points."""
-        return self.bounds[self._place[instance_id]] if instance_id in self._place else np.full((2, 3), np.nan)
+        return self.bounds[self._row[instance_id]] if instance_id in self._row else np.full((2, 3), np.nan)
 
     def distance(self, instance_id: int, point: np.ndarray) -> float:
         """From a point [3] to the nearest of the instance's points; infinite without points."""
@@ -35,8 +35,8 @@ class SpatialIndex:
 
     def nearest(self, point: np.ndarray, count: int, ids: Iterable[int]) -> list[tuple[float, int]]:
         """The `count` instances of `ids` with the nearest points: (distance, id), nearest first, ties by id."""
-        known = [i for i in ids if i in self._place]
-        bounds = self.bounds[[self._place[i] for i in known]].reshape(-1, 2, 3)
+        known = [i for i in ids if i in self._row]
+        bounds = self.bounds[[self._row[i] for i in known]].reshape(-1, 2, 3)
         apart = np.maximum(bounds[:, 0] - point, point - bounds[:, 1])
         return _closest(known, apart, count, lambda i, _: self.distance(i, point))
 
@@ -67,7 +67,7 @@ class SpatialIndex:
             return []
         tree = cKDTree(points)
         low, high = self.aabb(instance_id)
-        bounds = self.bounds[[self._place[i] for i in others]]
+        bounds = self.bounds[[self._row[i] for i in others]]
         apart = np.maximum(bounds[:, 0] - high, low - bounds[:, 1])
 
         def gap(other: int, most: float) -> float:

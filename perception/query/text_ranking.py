@@ -15,7 +15,7 @@ from perception.language.printed import Printed
 from perception.machine import torch_on_one_thread
 from perception.map.map import Map
 from perception.query.ranking import Answer, Ranker
-from perception.query.relations import Places, ranked
+from perception.query.relations import LevelBoxes, ranked
 from perception.query.where import tidy
 
 Encoders = Callable[[str], Encoder | None]
@@ -49,7 +49,7 @@ class TextRanking:
     def _ranked(self, text: str) -> Answer:
         with torch_on_one_thread():
             named = self._by_label(text) is not None
-            return self.ranker.rank(text) if named else ranked(self.ranker, self.places, text)
+            return self.ranker.rank(text) if named else ranked(self.ranker, self.boxes, text)
 
     def _by_label(self, text: str) -> Answer | None:
         """The instances that the user labelled `text`, None without any. Needs no embeddings and no encoder."""
@@ -86,9 +86,9 @@ class TextRanking:
         return Ranker(descriptions, encoder, labels, self._shapes, printed_on(self._gmap), sizes)
 
     @cached_property
-    def places(self) -> Places | None:
-        """Where the instances stand to each other; None where up is not known."""
-        return Places.of(self._gmap)
+    def boxes(self) -> LevelBoxes | None:
+        """The instances' boxes with z up; None where up is not known."""
+        return LevelBoxes.of(self._gmap)
 
     def _shapes(self) -> np.ndarray:
         from perception.frame.gravity import Gravity

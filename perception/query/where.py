@@ -65,7 +65,7 @@ class Where:
         if self.region is not None:
             object.__setattr__(self, "region", check_box(self.region))
         if self.near is not None:
-            object.__setattr__(self, "near", place(self.near))
+            object.__setattr__(self, "near", position_of(self.near))
         if self.labels is not None:
             names = [self.labels] if isinstance(self.labels, str) else list(self.labels)
             if not all(isinstance(name, str) for name in names):
@@ -86,20 +86,20 @@ class Where:
         """The same filter in the map's frame, given the frame that its values are in."""
         if frame is None:
             return self
-        map_from_frame = frame.to_map
-        scale = scale_of(map_from_frame)
-        within, least, most = (None if x is None else x * scale for x in (self.within, self.min_size, self.max_size))
-        return replace(
-            self,
-            region=None if self.region is None else move_box(map_from_frame, self.region),
-            near=None if self.near is None else move_points(map_from_frame, np.asarray(self.near)),
-            within=within,
-            min_size=least,
-            max_size=most,
-        )
+        scale = scale_of(frame.to_map)
+        moved: dict[str, Any] = {
+            name: value * scale
+            for name in ("within", "min_size", "max_size")
+            if (value := getattr(self, name)) is not None
+        }
+        if self.region is not None:
+            moved["region"] = move_box(frame.to_map, self.region)
+        if self.near is not None:
+            moved["near"] = move_points(frame.to_map, np.asarray(self.near))
+        return replace(self, **moved)
 
 
-def place(point_or_pose: Any) -> np.ndarray:
+def position_of(point_or_pose: Any) -> np.ndarray:
     """[3] float64: a point as it is, or the origin of a pose [4, 4] (map_from_robot); InputError for other input."""
     array = numbers(point_or_pose, "near", "a point [3] or a pose [4, 4]")
     if array.shape == (4, 4):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
@@ -14,13 +14,11 @@ from starlette.concurrency import run_in_threadpool
 
 from perception import __version__
 from perception.io.ply import ply_bytes
-from perception.query.query_map import QueryMap
-from perception.query.requests import source
-from perception.query.where import Frame
+from perception.query import Frame, Hit, QueryMap
 from perception.serve.bodies import AtBody, FindBody, NearestBody, QueryBody
 from perception.serve.engine import QueryEngine
-from perception.serve.guard import HANDLERS, Guard
-from perception.serve.server import ServeSettings
+from perception.serve.guard import HANDLERS, HttpGuard
+from perception.serve.requests import ServeSettings, source
 
 FORMATS = {"npz": "application/x-npz", "ply": "application/octet-stream"}
 """Name → media type."""
@@ -38,19 +36,9 @@ def encode(gmap: QueryMap, instance_id: int, kind: str) -> bytes:
         ids = np.full(len(hit.points), instance_id, np.int32)
         return ply_bytes({"vertex": {**columns, "instance_id": ids}})
     buffer = io.BytesIO()
-    np.savez(
-        buffer,
-        points=hit.points,
-        centroid=hit.centroid,
-        covariance=hit.covariance,
-        obb_center=hit.obb.center,
-        obb_rotation=hit.obb.rotation,
-        obb_extent=hit.obb.extent,
-        instance_id=np.int64(instance_id),
-        frame=np.array(gmap.frame),
-        metric=np.array(gmap.metric),
-        map_id=np.array(gmap.map_id),
-    )
+    box = {"obb_center": hit.obb.center, "obb_rotation": hit.obb.rotation, "obb_extent": hit.obb.extent}
+    fields = {"points": hit.points, "centroid": hit.centroid, "covariance": hit.covariance, **box, **source(gmap)}
+    np.savez(buffer, instance_id=np.int64(instance_id), **fields)  # type: ignore[arg-type]
     return buffer.getvalue()
 
 
@@ -58,7 +46,7 @@ T = TypeVar("T")
 MapId = Annotated[str | None, Query(description="answer only from this very map, else 409")]
 Id = Annotated[int, Path(alias="id", ge=0, lt=10**9)]
 _ABOUT = (
-    "Text prompts and places in, 3D instances of a map out. Lengths are in the unit of the map's frame, metres when "
+    "Text prompts and positions in, 3D instances of a map out. Lengths are in the unit of the map's frame, metres when "
     "`metric`. With `frame`, everything in a request and its answer is in that frame. An error is one JSON object, "
     '{"error": line, "status": code}. Points are bytes; the header X-Map-Id names their map.'
 )
@@ -75,92 +63,81 @@ def build_app(engine: QueryEngine, settings: ServeSettings) -> FastAPI:
         redirect_slashes=False,
         exception_handlers=HANDLERS,
     )
-    app.add_middleware(Guard, settings=settings)
-    routes = _Routes(engine)
-    app.get("/health")(routes.health)
-    app.post("/query")(routes.query)
-    app.post("/find")(routes.find)
-    app.post("/nearest")(routes.nearest)
-    app.post("/at")(routes.at)
-    app.post("/reload")(routes.reload)
-    app.get("/instances")(routes.instances)
-    app.get("/instances/{id}")(routes.describe)
-    app.get("/instances/{id}/points", response_class=Response)(routes.points)
-    return app
+    app.add_middleware(HttpGuard, settings=settings)
 
+    async def answered(map_id: str | None, work: Callable[[QueryMap], T]) -> T:
+        """The result of `work` in the engine, on the map with this id if one is given."""
+        return await engine.awaited(engine.run(work, map_id=map_id))
 
-class _Routes:
-    """One method per route. Each answer is computed on one map, given in `map_id` or in the header X-Map-Id."""
-
-    def __init__(self, engine: QueryEngine) -> None:
-        self.engine = engine
-
-    async def health(self, request: Request) -> Response:
-        """How the server is; without the token its status only."""
-        health = self.engine.health()
-        shown = health if request.state.trusted else {"status": health["status"]}
-        return JSONResponse(shown, 200 if health["status"] != "closed" else 503)
-
-    async def query(self, body: QueryBody, map_id: MapId = None) -> Response:
-        """The instances that answer each text, ranked."""
-        questions = body.requests()
-
-        def work(gmap: QueryMap) -> dict[str, Any]:
-            results = [question.answered(gmap, time.monotonic()).to_json() for question in questions]
-            return {"results": results, **source(gmap, questions[0].frame)}
-
-        return JSONResponse(await self._answer(map_id, work))
-
-    async def find(self, body: FindBody, map_id: MapId = None) -> Response:
-        """All instances that fulfil a filter."""
-        where, frame = body.asked_where(), body.asked_frame()
-        return await self._hits(map_id, lambda gmap: gmap.find(where, frame=frame), frame)
-
-    async def nearest(self, body: NearestBody, map_id: MapId = None) -> Response:
-        """The instances nearest to a point or pose."""
-        where, frame, top_k = body.asked_where(), body.asked_frame(), body.top_k or 1
-        return await self._hits(
-            map_id, lambda gmap: gmap.nearest(np.array(body.near), top_k, where=where, frame=frame), frame
-        )
-
-    async def at(self, body: AtBody, map_id: MapId = None) -> Response:
-        """The instance that a point lies on."""
-        frame = body.asked_frame()
-
-        def work(gmap: QueryMap) -> list[Any]:
-            hit = gmap.instance_at(np.array(body.point), max_distance=body.max_distance, frame=frame)
-            return [] if hit is None else [hit]
-
-        return await self._hits(map_id, work, frame)
-
-    async def instances(self, map_id: MapId = None) -> Response:
-        """All instances."""
-        return await self._hits(map_id, lambda gmap: gmap.find(), None)
-
-    async def describe(self, number: Id, map_id: MapId = None) -> Response:
-        """One instance."""
-        described = await self._answer(map_id, lambda gmap: {**gmap.describe(number).to_json(), **source(gmap)})
-        return JSONResponse(described)
-
-    async def points(self, number: Id, map_id: MapId = None, format: Literal["npz", "ply"] = "npz") -> Response:
-        """The instance's points, float32, in the map's frame; the header X-Map-Id names the map."""
-        made_by, data = await self._answer(map_id, lambda gmap: (gmap.map_id, encode(gmap, number, format)))
-        name = f'attachment; filename="instance_{number}.{format}"'
-        return Response(data, media_type=FORMATS[format], headers={"X-Map-Id": made_by, "Content-Disposition": name})
-
-    async def reload(self) -> Response:
-        """Takes over the map that lies on disk now."""
-        changed = await run_in_threadpool(self.engine.reload)
-        return JSONResponse({"changed": changed, "map_id": self.engine.current.map_id})
-
-    # ------------------------------------------------------------------ shared
-
-    async def _answer(self, wanted: str | None, work: Callable[[QueryMap], T]) -> T:
-        """The result of `work` in the engine."""
-        return await self.engine.awaited(self.engine.run(work, map_id=wanted))
-
-    async def _hits(self, wanted: str | None, work: Callable[[QueryMap], list[Any]], frame: Frame | None) -> Response:
+    async def hits(map_id: str | None, frame: Frame | None, work: Callable[[QueryMap], Sequence[Hit]]) -> Response:
         def answer(gmap: QueryMap) -> dict[str, Any]:
             return {"hits": [hit.to_json() for hit in work(gmap)], **source(gmap, frame)}
 
-        return JSONResponse(await self._answer(wanted, answer))
+        return JSONResponse(await answered(map_id, answer))
+
+    @app.get("/health")
+    async def health(request: Request) -> Response:
+        """The state of the server; without the token its status only."""
+        health = engine.health()
+        shown = health if request.state.trusted else {"status": health["status"]}
+        return JSONResponse(shown, 200 if health["status"] != "closed" else 503)
+
+    @app.post("/query")
+    async def query(body: QueryBody, map_id: MapId = None) -> Response:
+        """The instances that answer each text, ranked."""
+        requests = body.requests()
+
+        def work(gmap: QueryMap) -> dict[str, Any]:
+            results = [request.answered(gmap, time.monotonic()).to_json() for request in requests]
+            return {"results": results, **source(gmap, requests[0].frame)}
+
+        return JSONResponse(await answered(map_id, work))
+
+    @app.post("/find")
+    async def find(body: FindBody, map_id: MapId = None) -> Response:
+        """All instances that fulfil a filter."""
+        where, frame = body.query_where(), body.query_frame()
+        return await hits(map_id, frame, lambda gmap: gmap.find(where, frame=frame))
+
+    @app.post("/nearest")
+    async def nearest(body: NearestBody, map_id: MapId = None) -> Response:
+        """The instances nearest to a point or pose."""
+        where, frame, near = body.query_where(), body.query_frame(), np.array(body.near)
+        return await hits(map_id, frame, lambda gmap: gmap.nearest(near, body.top_k or 1, where=where, frame=frame))
+
+    @app.post("/at")
+    async def at(body: AtBody, map_id: MapId = None) -> Response:
+        """The instance that a point lies on."""
+        frame = body.query_frame()
+
+        def work(gmap: QueryMap) -> list[Hit]:
+            hit = gmap.instance_at(np.array(body.point), max_distance=body.max_distance, frame=frame)
+            return [] if hit is None else [hit]
+
+        return await hits(map_id, frame, work)
+
+    @app.post("/reload")
+    async def reload() -> Response:
+        """Takes over the map that lies on disk now."""
+        changed = await run_in_threadpool(engine.reload)
+        return JSONResponse({"changed": changed, "map_id": engine.current.map_id})
+
+    @app.get("/instances")
+    async def instances(map_id: MapId = None) -> Response:
+        """All instances."""
+        return await hits(map_id, None, lambda gmap: gmap.find())
+
+    @app.get("/instances/{id}")
+    async def describe(number: Id, map_id: MapId = None) -> Response:
+        """One instance."""
+        answer = await answered(map_id, lambda gmap: {**gmap.describe(number).to_json(), **source(gmap)})
+        return JSONResponse(answer)
+
+    @app.get("/instances/{id}/points", response_class=Response)
+    async def points(number: Id, map_id: MapId = None, format: Literal["npz", "ply"] = "npz") -> Response:
+        """The instance's points, float32, in the map's frame; the header X-Map-Id names the map."""
+        made_by, data = await answered(map_id, lambda gmap: (gmap.map_id, encode(gmap, number, format)))
+        name = f'attachment; filename="instance_{number}.{format}"'
+        return Response(data, media_type=FORMATS[format], headers={"X-Map-Id": made_by, "Content-Disposition": name})
+
+    return app

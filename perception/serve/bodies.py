@@ -13,8 +13,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError
 
 from perception.errors import InputError
-from perception.query.requests import MAX_TEXT, MAX_TEXTS, MAX_TOP, TOP, Request
+from perception.query.requests import MAX_TEXT, MAX_TOP, TOP
 from perception.query.where import Frame, Where, axis_box
+from perception.serve.requests import MAX_TEXTS, Request
 from perception.types import OrientedBox
 
 MAX_NUMBER = 1e12
@@ -34,7 +35,7 @@ _LIST_OR_NESTED = Discriminator(
     lambda value: "nested" if isinstance(value, list) and value and isinstance(value[0], list) else "list"
 )
 _SINGLE_OR_LIST = Discriminator(lambda value: "list" if isinstance(value, list) else "single")
-Place = Annotated[Annotated[Point, Tag("list")] | Annotated[Matrix, Tag("nested")], _LIST_OR_NESTED]
+PointOrPose = Annotated[Annotated[Point, Tag("list")] | Annotated[Matrix, Tag("nested")], _LIST_OR_NESTED]
 """A point [3], or a pose [4, 4] of which only the origin is used."""
 Prompts = Annotated[
     Annotated[Prompt, Tag("single")] | Annotated[list[Prompt], Field(min_length=1, max_length=MAX_TEXTS), Tag("list")],
@@ -84,7 +85,7 @@ class WhereBody(Body):
 
     region: AnyRegion | None = None
     share: Annotated[float, Field(gt=0, le=1)] | None = None
-    near: Place | None = None
+    near: PointOrPose | None = None
     within: Length | None = None
     min_size: Length | None = None
     max_size: Length | None = None
@@ -113,7 +114,7 @@ class FramedBody(Body):
 
     frame: FrameBody | None = None
 
-    def asked_frame(self) -> Frame | None:
+    def query_frame(self) -> Frame | None:
         return None if self.frame is None else self.frame.frame()
 
 
@@ -122,7 +123,7 @@ class FilteredBody(FramedBody):
 
     where: WhereBody | None = None
 
-    def asked_where(self) -> Where | None:
+    def query_where(self) -> Where | None:
         return None if self.where is None else self.where.where()
 
 
@@ -136,7 +137,7 @@ class QueryBody(FilteredBody):
     def requests(self) -> list[Request]:
         """One Request for each prompt."""
         texts = self.text if isinstance(self.text, list) else [self.text]
-        where, frame, top_k = self.asked_where(), self.asked_frame(), self.top_k or TOP
+        where, frame, top_k = self.query_where(), self.query_frame(), self.top_k or TOP
         return [Request(text, top_k, self.min_score, where, frame) for text in texts]
 
 
@@ -147,7 +148,7 @@ class FindBody(FilteredBody):
 class NearestBody(FilteredBody):
     """The instances nearest to a point, or to the origin of a pose."""
 
-    near: Place
+    near: PointOrPose
     top_k: Annotated[int, Field(ge=1, le=MAX_TOP)] | None = None
 
 
@@ -173,7 +174,6 @@ def problem_line(errors: Sequence[Any]) -> str:
     """One of pydantic's errors as a line: field, expected, found. An unknown field takes precedence."""
     first = next((error for error in errors if error["type"] == "extra_forbidden"), errors[0])
     tags = {"body", "query", "list", "nested", "single", "corners", "box"}
-    place = ".".join(str(part) for part in first["loc"] if part not in tags)
-    found = repr(first.get("input"))
+    field = ".".join(str(part) for part in first["loc"] if part not in tags)
     expected = str(first["msg"]).removeprefix("Value error, ")
-    return f"{place[:80] or 'request'}: {expected[0].lower()}{expected[1:]}, found {found[:60]}"
+    return f"{field[:80] or 'request'}: {expected[0].lower()}{expected[1:]}, found {repr(first.get('input'))[:60]}"

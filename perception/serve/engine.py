@@ -26,8 +26,8 @@ from perception.errors import InputError
 from perception.language.base import Encoder
 from perception.language.encoders import make_encoder
 from perception.map.files import map_signature
-from perception.query.query_map import QueryMap, load_map
-from perception.query.requests import (
+from perception.query import QueryMap, load_map
+from perception.serve.requests import (
     AnswerTimeout,
     EngineBusy,
     EngineClosed,
@@ -103,10 +103,9 @@ class QueryEngine:
 
     def submit(self, request: Request | str, timeout: float | None = None) -> Future[Reply]:
         """Queues a prompt and returns its future, which raises as `ask` does. EngineBusy when the queue is full."""
-        asked = time.monotonic()
-        item = Request(request) if isinstance(request, str) else request
-
-        return self.run(lambda gmap: item.answered(gmap, asked), timeout)
+        since = time.monotonic()
+        prompt = Request(request) if isinstance(request, str) else request
+        return self.run(lambda gmap: prompt.answered(gmap, since), timeout)
 
     def run(self, work: Callable[[QueryMap], T], timeout: float | None = None, map_id: str | None = None) -> Future[T]:
         """Queues `work`, which a worker thread calls with the current map. EngineBusy when the queue is full. The
@@ -164,7 +163,7 @@ class QueryEngine:
                     return False
                 fresh = self.open_map()
             except Exception as error:  # of any class: people edit instances.json by hand
-                raise self._told(error) from error
+                raise self._unreadable(error) from error
             self._signature, self._problem, old = signature, None, self._map
             self._map = fresh
             self._counters.count("reloads")
@@ -179,8 +178,8 @@ class QueryEngine:
                     self._unserved = f"{self.path}: not all of the map can be served ({_brief(error)})"
             return True
 
-    def _told(self, error: Exception) -> InputError:
-        """The error as an InputError, which `health` tells from now on; logged when it is a new one."""
+    def _unreadable(self, error: Exception) -> InputError:
+        """The error as an InputError, which `health` reports from now on; logged when it is a new one."""
         known = isinstance(error, InputError)
         line = error_line(error) if known else f"{self.path}: cannot be opened ({_brief(error)}); mend or replace it"
         if line != self._problem:
@@ -189,7 +188,7 @@ class QueryEngine:
         return InputError(line)
 
     def on_reload(self, listener: Callable[[QueryMap], object]) -> None:
-        """Registers `listener(new map)`, called after each swap by the reloading thread; `health` tells its errors."""
+        """Registers `listener(new map)`, called by the reloading thread after a swap; `health` reports its errors."""
         self._listeners.append(listener)
 
     def open_map(self) -> QueryMap:
@@ -208,7 +207,7 @@ class QueryEngine:
             try:
                 signature = map_signature(self.path)
             except Exception as error:
-                self._told(error)
+                self._unreadable(error)
                 tried = None
                 continue
             if signature == self._signature:
@@ -290,7 +289,7 @@ class QueryEngine:
             self._counters.count("failed")
             job.future.set_exception(error)
         else:
-            self._counters.answered(time.monotonic() - job.asked)
+            self._counters.count("answered", time.monotonic() - job.since)
             job.future.set_result(result)
 
 
@@ -300,11 +299,11 @@ def _brief(error: Exception) -> str:
 
 @dataclass(eq=False)
 class Job:
-    """A queued request: `work` is called with the map, `future` gets its result. asked, deadline: monotonic seconds."""
+    """A queued request: `work` is called with the map, `future` gets its result. since, deadline: monotonic seconds."""
 
     work: Callable[[QueryMap], Any]
     future: Future[Any]
-    asked: float
+    since: float
     deadline: float
 
 
@@ -364,14 +363,12 @@ class Counters:
         self._lock = threading.Lock()
         self._started = time.monotonic()
 
-    def count(self, name: str) -> None:
+    def count(self, name: str, seconds: float | None = None) -> None:
+        """One more; seconds: the latency of an answer."""
         with self._lock:
             self._totals[name] += 1
-
-    def answered(self, seconds: float) -> None:
-        with self._lock:
-            self._totals["answered"] += 1
-            self._recent.append(seconds)
+            if seconds is not None:
+                self._recent.append(seconds)
 
     def to_json(self) -> dict[str, Any]:
         with self._lock:

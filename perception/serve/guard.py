@@ -5,7 +5,6 @@ every failure is one JSON object with a one-line message, {"error": line, "statu
 from __future__ import annotations
 
 import asyncio
-import hmac
 import logging
 import time
 from collections.abc import Mapping
@@ -16,15 +15,14 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
-from perception.query.requests import KINDS, error_kind, error_line
 from perception.serve.bodies import problem_line
-from perception.serve.listening import names_this_machine
-from perception.serve.server import ServeSettings
+from perception.serve.listening import Guard
+from perception.serve.requests import KINDS, ServeSettings, error_kind, error_line
 
 _log = logging.getLogger("perception.serve")
 _STATUS = {"unknown_instance": 404, "other_map": 409, "busy": 503, "closed": 503, "timeout": 504}
 _STATUS |= dict.fromkeys(("unknown_frame", "no_scale", "bad_input"), 400)
-"""HTTP status by the word of `error_kind`."""
+"""HTTP status by `error_kind`."""
 
 
 def problem(status: int, line: str, headers: Mapping[str, str] | None = None) -> JSONResponse:
@@ -77,26 +75,23 @@ _HEADERS = [
 Message = dict[str, Any]
 
 
-class Guard:
+class HttpGuard:
     """ASGI middleware. Sets scope["state"]["trusted"]: whether the client sent the token, or none is required.
 
-    A web page opened in a browser on this machine could send requests here too. So without a token the Host header must
-    name this machine (against DNS rebinding), and a POST must have the JSON content type. Pages of other origins may
-    send that only after a preflight request, which is never granted.
+    Without a token the Host header must name this machine, and a POST must have the JSON content type. Pages of other
+    origins may send that only after a preflight request, which is never granted.
     """
 
     def __init__(self, app: Any, settings: ServeSettings) -> None:
-        self.app, self.settings = app, settings
+        self.app, self.settings, self.guard = app, settings, Guard(settings.host, settings.token)
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
         headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
-        kind, _, given = headers.get("authorization", "").partition(" ")
-        trusted = (token := self.settings.token) is None or (
-            kind.lower() == "bearer" and hmac.compare_digest(given.strip().encode(), token.encode())
-        )
+        kind, _, shown = headers.get("authorization", "").partition(" ")
+        trusted = self.guard.trusts(shown.strip() if kind.lower() == "bearer" else "")
         scope.setdefault("state", {})["trusted"] = trusted
         refusal = self._refusal(scope, headers, trusted)
         if refusal is None and scope["method"] in ("POST", "PUT", "PATCH"):
@@ -108,11 +103,9 @@ class Guard:
 
     def _refusal(self, scope: Any, headers: dict[str, str], trusted: bool) -> Any:
         """The response that rejects the request, or None."""
-        settings = self.settings
-        if settings.token is None:
-            name = headers.get("host", "")
-            if not names_this_machine(name, settings.host):
-                return problem(403, f"Host '{name[:80]}' is not this machine; ask for 127.0.0.1 or localhost")
+        name = headers.get("host", "")
+        if self.guard.token is None and not self.guard.names_this_machine(name):
+            return problem(403, f"Host '{name[:80]}' is not this machine; ask for 127.0.0.1 or localhost")
         if not trusted and scope["path"] not in OPEN:
             why = "the token is wrong" if "authorization" in headers else "a token is needed"
             return problem(401, f"{why}; send it as 'Authorization: Bearer TOKEN'", {"WWW-Authenticate": "Bearer"})
@@ -150,15 +143,11 @@ class Guard:
 
 
 def _replay(body: bytes, receive: Any) -> Any:
-    sent = False
+    """A `receive` that returns the whole body first."""
+    waiting = [{"type": "http.request", "body": body, "more_body": False}]
 
     async def again() -> Message:
-        nonlocal sent
-        if sent:
-            message: Message = await receive()
-            return message
-        sent = True
-        return {"type": "http.request", "body": body, "more_body": False}
+        return waiting.pop() if waiting else await receive()
 
     return again
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import hmac
 import ipaddress
 import socket
+from dataclasses import dataclass
 from pathlib import Path
 
 from perception.errors import InputError, refuse_named_pipe
@@ -33,14 +35,26 @@ def check_address(host: str, port: int, token: str | None) -> None:
         raise InputError(f"--host {host}: others could reach the map there, so a token is needed: {MAKE_TOKEN}")
 
 
-def names_this_machine(header: str, host: str) -> bool:
-    """Whether a request's Host header is a loopback name or `host`, the address that the server listens on.
+@dataclass(frozen=True)
+class Guard:
+    """Who may use a server that listens on `host`: clients that show `token`; all, when it is None.
 
-    This prevents DNS rebinding: a web page of another site can make its name resolve to 127.0.0.1, so that the browser
-    lets it read responses of this server. Its requests still have that name in the Host header.
+    Any web page in a browser on this machine can send requests here too. `names_this_machine` prevents DNS rebinding: a
+    page of another site can make its name resolve to 127.0.0.1, so that the browser lets it read responses of this
+    server. Its requests still have that name in the Host header.
     """
-    name = header[: header.index("]") + 1] if header.startswith("[") and "]" in header else header.partition(":")[0]
-    return name.lower() in _LOCAL_NAMES | {url_host(host).lower()}
+
+    host: str
+    token: str | None
+
+    def trusts(self, shown: str) -> bool:
+        """Whether `shown` is the token, or none is needed; in a time that does not depend on where they differ."""
+        return self.token is None or hmac.compare_digest(shown.encode("utf-8", "replace"), self.token.encode())
+
+    def names_this_machine(self, header: str) -> bool:
+        """Whether a request's Host header is a loopback name or `host`."""
+        name = header[: header.index("]") + 1] if header.startswith("[") and "]" in header else header.partition(":")[0]
+        return name.lower() in _LOCAL_NAMES | {url_host(self.host).lower()}
 
 
 def url_host(host: str) -> str:

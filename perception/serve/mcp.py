@@ -26,12 +26,13 @@ from perception.geometry import scale_of
 from perception.query import Frame, Hit, QueryMap, Where
 from perception.query.crops import OUTSIDE, PhotoOutside, best_crop, photos_outside
 from perception.query.hit import printed_texts
-from perception.query.requests import MAX_TOP, NoScale, UnknownFrame, error_kind, error_line, source
+from perception.query.requests import MAX_TOP
+from perception.query.robot_pose import where_to_stand
 from perception.query.scene_graph import scene_graph
-from perception.query.standing import where_to_stand
-from perception.serve.bodies import AnyRegion, Body, FrameBody, Length, Place, Prompt, Text, parse
+from perception.serve.bodies import AnyRegion, Body, FrameBody, Length, PointOrPose, Prompt, Text, parse
 from perception.serve.engine import QueryEngine
-from perception.serve.server import ServeSettings, serve
+from perception.serve.requests import NoScale, ServeSettings, UnknownFrame, error_kind, error_line, source
+from perception.serve.server import serve
 
 try:
     from mcp import MCPError, types
@@ -101,7 +102,7 @@ class MeasureAnswer(Answer):
     nearest_points: list[Vector] = Field(description="one of a, one of b")
 
 
-class StandAnswer(Answer):
+class PoseAnswer(Answer):
     position: Vector = Field(description="on the floor")
     yaw: float = Field(description="of x about z, radians")
     pose: list[list[float]] = Field(description="[4, 4] frame_from_robot: origin on the floor, x to the instance, z up")
@@ -162,7 +163,7 @@ class ListObjects(Tool):
 class Nearest(Tool):
     """The instances nearest to a point, or to the origin of a pose, each with its distance."""
 
-    point: Place
+    point: PointOrPose
     top_k: Top = 1
 
     def fields_of(self, gmap: QueryMap, frame: Frame | None, photos: Path | None) -> dict[str, Any]:
@@ -176,7 +177,7 @@ class Describe(Tool):
     id: Id
 
     def fields_of(self, gmap: QueryMap, frame: Frame | None, photos: Path | None) -> dict[str, Any]:
-        told, place = gmap.describe(self.id, frame=frame), gmap.position(self.id)
+        described, position = gmap.describe(self.id, frame=frame), gmap.position(self.id)
         kind, image, note = "photo", None, None
         try:
             image = best_crop(gmap, self.id, CROP_SIDE, photos)
@@ -186,10 +187,16 @@ class Describe(Tool):
             from perception.export.render import rendered_crop
 
             kind, image = "render", rendered_crop(gmap, self.id, CROP_SIDE)
-        fields: dict[str, Any] = {"colors": dict(told.colors), "texts": printed_texts(gmap.instances[place])}
-        fields["relations"] = [edge for edge in _relations(gmap) if str(self.id) in (edge["thing"], edge["other"])]
-        picture = {"picture": None if image is None else kind, "image": image, "note": note}
-        return {**told.to_json(), "names": _names(gmap)[place], **fields, **picture}
+        return {
+            **described.to_json(),
+            "names": _names(gmap)[position],
+            "colors": dict(described.colors),
+            "texts": printed_texts(gmap.instances[position]),
+            "relations": [edge for edge in _relations(gmap) if str(self.id) in (edge["thing"], edge["other"])],
+            "picture": None if image is None else kind,
+            "image": image,
+            "note": note,
+        }
 
 
 class Measure(Tool):
@@ -213,9 +220,9 @@ class Measure(Tool):
 
 
 class WhereToStand(Tool):
-    """A place on the free floor from which a robot faces and sees an instance. Only where the map is metric."""
+    """The pose on the free floor from which a robot faces and sees an instance. Only where the map is metric."""
 
-    answer = StandAnswer
+    answer = PoseAnswer
     id: Id
     radius: Annotated[Length, Field(description="of the robot, metres")] = 0.25
     distance: Annotated[Length, Field(description="wanted from the robot's centre to the instance, metres")] = 0.6
@@ -224,10 +231,10 @@ class WhereToStand(Tool):
         score = gmap.get(self.id).score
         if not gmap.metric:
             raise NoScale("where_to_stand: this map's scale is not known, and a robot's size is in metres")
-        stand = where_to_stand(gmap, self.id, radius=self.radius, distance=self.distance, frame=frame)
-        gap = stand.distance * (1.0 if frame is None else scale_of(frame.from_map))
-        place = {"position": stand.position.tolist(), "yaw": stand.yaw, "pose": stand.map_from_robot.tolist()}
-        return {**place, "distance": gap, "seen": stand.seen, "confidence": score}
+        robot = where_to_stand(gmap, self.id, radius=self.radius, distance=self.distance, frame=frame)
+        gap = robot.distance * (1.0 if frame is None else scale_of(frame.from_map))
+        pose = {"position": robot.position.tolist(), "yaw": robot.yaw, "pose": robot.map_from_robot.tolist()}
+        return {**pose, "distance": gap, "seen": robot.seen, "confidence": score}
 
 
 TOOLS: dict[str, type[Tool]] = {"find": Find, "list_objects": ListObjects, "describe": Describe}
@@ -276,8 +283,8 @@ def make_server(engine: QueryEngine, photos: Path | None = None) -> Server[Any]:
             raise MCPError(types.INVALID_PARAMS, f"no tool '{params.name[:40]}', expected one of: {', '.join(TOOLS)}")
         jpeg = None
         try:
-            asked = parse(TOOLS[params.name], params.arguments or {})
-            future = engine.run(partial(asked.answered, photos=photos), map_id=asked.map_id)
+            tool = parse(TOOLS[params.name], params.arguments or {})
+            future = engine.run(partial(tool.answered, photos=photos), map_id=tool.map_id)
             result, jpeg = await engine.awaited(future)
         except Exception as error:
             kind, line = error_kind(error), error_line(error)
@@ -327,12 +334,12 @@ def serve_http(path: Path, settings: ServeSettings, encoders: Any = None, photos
 
     No session is kept: each request is answered by itself, so a client may vanish at any time.
     """
-    from perception.serve.guard import Guard
+    from perception.serve.guard import HttpGuard
 
     def build(engine: QueryEngine, settings: ServeSettings) -> Any:
         server, host = make_server(engine, photos), settings.host
         app = server.streamable_http_app(stateless_http=True, max_request_body_size=settings.max_body, host=host)
-        app.add_middleware(Guard, settings=settings)
+        app.add_middleware(HttpGuard, settings=settings)
         return app
 
     serve(path, settings, encoders, build, "/mcp")

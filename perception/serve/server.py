@@ -9,28 +9,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field
-
 from perception.errors import missing_extra
 from perception.language.base import Encoder
-from perception.query.requests import MAX_BYTES, EngineSettings
 from perception.serve.engine import QueryEngine
 from perception.serve.listening import check_address, listen, url_host
+from perception.serve.requests import ServeSettings
 
 MAX_CONNECTIONS = 256
 MAX_WAITING = MAX_CONNECTIONS // 2
 """Largest number of connections whose next header is not complete."""
 _TOTAL_TIMEOUT = 300.0
 """Seconds from a request's header to the end of its answer: 100 MB of points at 3 Mbit/s."""
-
-
-class ServeSettings(EngineSettings):
-    """How one process serves one map over HTTP. `serve` checks host and token."""
-
-    host: str = Field("127.0.0.1", description="where to listen")
-    port: int = Field(8765, ge=0, le=65535, description="0: any free one")
-    token: str | None = Field(None, description="clients send it as a bearer token; none only on this machine")
-    max_body: int = Field(MAX_BYTES, ge=1, description="bytes of a request")
 
 
 def serve(

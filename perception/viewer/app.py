@@ -17,8 +17,8 @@ import numpy as np
 
 from perception.colors import instance_palette
 from perception.errors import InputError, missing_extra
-from perception.serve.listening import check_address, listen, url_host
-from perception.viewer.guard import Guard, guarded_server
+from perception.serve.listening import Guard, check_address, listen, url_host
+from perception.viewer.handshake import guarded_server
 from perception.viewer.levels import MOST, Level, level
 from perception.viewer.panel import Panel
 from perception.viewer.picking import covariances
@@ -56,7 +56,7 @@ class Viewer:
             sock = undo.enter_context(listen(host, port))
             self.session = Session(path, photos)
             label = f"perception · {path.name}"
-            self.server = guarded_server(Guard(token, host), sock, host=host, port=port, label=label, verbose=False)
+            self.server = guarded_server(Guard(host, token), sock, host=host, port=port, label=label, verbose=False)
             undo.pop_all()  # the server owns the socket from here on
         shown = "localhost" if host in ("127.0.0.1", "0.0.0.0", "::") else url_host(host)
         self.address = f"http://{shown}:{sock.getsockname()[1]}"
@@ -141,10 +141,10 @@ class Viewer:
                 points = np.array(box["center"]) + (CORNERS * box["extent"]) @ np.array(box["rotation"])
                 segments = (points[EDGES] * self.scale).astype(np.float32)
                 style = {"thickness": 2, "thickness_units": "screen"}
-                color, place = tuple(instance_palette([number])[0].tolist()), np.array(entry["centroid"]) * self.scale
+                color, middle = tuple(instance_palette([number])[0].tolist()), np.array(entry["centroid"]) * self.scale
                 self._overlays += [
                     scene.add_line_segments(f"/map/boxes/{number}", segments, color, **style),
-                    scene.add_label(f"/map/names/{number}", session.name(entry), position=tuple(place)),
+                    scene.add_label(f"/map/names/{number}", session.name(entry), position=tuple(middle)),
                 ]
         if len(session.ends) == 2:
             ends = (np.array(session.ends) * self.scale).astype(np.float32)

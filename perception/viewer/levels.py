@@ -21,7 +21,7 @@ TOO_FEW = 0.9  # share of the wanted count from which a side is good enough
 
 @dataclass(frozen=True)
 class Level:
-    """M Gaussians in place of N. owner [N] int64: the row that each belongs to; weights [N] float32, w of the module;
+    """M Gaussians instead of N. owner [N] int64: the row that each belongs to; weights [N] float32, w of the module;
     means [M, 3], covariances [M, 3, 3] float32; areas [M] float32."""
 
     owner: np.ndarray
@@ -46,7 +46,7 @@ class Level:
 def level(
     means: np.ndarray, covariances: np.ndarray, opacities: np.ndarray, ids: np.ndarray, most: int = MOST
 ) -> Level:
-    """At most `most` Gaussians in place of N > `most`: means [N, 3], covariances [N, 3, 3], opacities [N]. ids [N]
+    """At most `most` Gaussians instead of N > `most`: means [N, 3], covariances [N, 3, 3], opacities [N]. ids [N]
     integers: Gaussians with different ids are never merged. Where there are more ids than `most`, so many remain."""
     areas = np.cbrt(np.maximum(np.linalg.det(covariances.astype(np.float64)), 1e-36))
     weights = np.maximum(opacities * areas, 1e-30)
@@ -72,10 +72,10 @@ def _cells(means: np.ndarray, ids: np.ndarray, most: int) -> tuple[np.ndarray, i
         cell = (inside / side).astype(np.int64)
         sizes = cell.max(axis=0) + 1
         key = ((names * sizes[0] + cell[:, 0]) * sizes[1] + cell[:, 1]) * sizes[2] + cell[:, 2]
-        found, owner = np.unique(key, return_inverse=True)
-        if len(found) <= most:
-            best, coarse = (owner.reshape(-1), len(found)), (fine + coarse) / 2
-            if len(found) >= TOO_FEW * most:
+        cells, owner = np.unique(key, return_inverse=True)
+        if len(cells) <= most:
+            best, coarse = (owner.reshape(-1), len(cells)), (fine + coarse) / 2
+            if len(cells) >= TOO_FEW * most:
                 break
         else:
             fine = (fine + coarse) / 2

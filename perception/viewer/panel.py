@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import string
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from perception.query.hit import printed_texts
 from perception.report.text import frame_lines
-from perception.viewer.session import MODES
-
-if TYPE_CHECKING:
-    from perception.viewer.app import Viewer
+from perception.viewer.session import MODES, Session
 
 _OF_ADDRESSES = {f"&#{ord(c)};" for c in ".:@"}
 
@@ -26,10 +23,26 @@ def escaped(text: str) -> str:
     return "".join(f"<wbr>{c}" if c in _OF_ADDRESSES else c for c in shown)
 
 
+class Page(Protocol):
+    """What the panel uses of the page (`app.Viewer`)."""
+
+    server: Any
+    session: Session
+
+    @property
+    def detail(self) -> str: ...
+
+    def redraw(self) -> None: ...
+
+    def show_boxes(self, on: bool) -> None: ...
+
+    def guarded(self, action: Callable[[], object], client: Any = None, edited: bool = False) -> None: ...
+
+
 class Panel:
     """Builds viser's controls and updates their texts."""
 
-    def __init__(self, viewer: Viewer):
+    def __init__(self, viewer: Page):
         self.viewer = viewer
         self.session = viewer.session
         self.gui = viewer.server.gui
@@ -70,7 +83,7 @@ class Panel:
         editor, session = self.session.editor, self.session
         self._selection = self.gui.add_folder("Selected")
         with self._selection:
-            self._words = self.gui.add_markdown("")
+            self._facts_of_selected = self.gui.add_markdown("")
             self._photo: Any = None
             self._named: tuple[int, str | None] | None = None
             with self.gui.add_form(None) as form:
@@ -134,14 +147,14 @@ class Panel:
         self._refresh_answer()
         photo = None
         if not session.selected:
-            self._words.content = "Click a thing; shift-click adds another."
+            self._facts_of_selected.content = "Click a thing; shift-click adds another."
         elif len(session.selected) > 1:
             names = [escaped(session.name(editor.entry(i))) for i in session.selected]
-            self._words.content = f"{len(names)} selected: {', '.join(names)}"
+            self._facts_of_selected.content = f"{len(names)} selected: {', '.join(names)}"
         else:
             entry = editor.entry(session.selected[0])
             sides = " × ".join(f"{side:.2f}" for side in entry["obb"]["extent"])
-            self._words.content = (
+            self._facts_of_selected.content = (
                 f"**{escaped(session.name(entry))}** (id {entry['id']})  \nconfidence {entry['score']:.2f} · "
                 f"{entry['num_gaussians']} Gaussians  \nbox {sides} {unit}"
                 + (f"  \n{len(entry['parts'])} parts; Split takes it apart" if entry.get("parts") else "")
@@ -152,7 +165,7 @@ class Panel:
                 self._named = named
                 self._name.value = entry.get("label") or ""
             photo, why = session.crop(entry["id"])
-            self._words.content += f"  \n{escaped(why)}" if why else ""
+            self._facts_of_selected.content += f"  \n{escaped(why)}" if why else ""
         self._show_photo(photo)
         wanted = f"click end {len(session.ends) + 1} of 2" if session.measuring else session.length
         lines = [wanted, *frame_lines(editor.original.info), *session.notes]
@@ -176,8 +189,8 @@ class Panel:
         self._answer.content = f'"{escaped(session.question)}": {len(session.hits)} found'
         with self._hits_folder:
             for rank, hit in enumerate(session.hits, start=1):
-                whole = session.editor.entry(hit.instance_id)
-                name = session.name(whole) if hit.part is None else f"part of {session.name(whole)}"
+                name = session.name(session.editor.entry(hit.instance_id))
+                name = name if hit.part is None else f"part of {name}"
                 button = self.gui.add_button(f"{rank}. {name} · {hit.score:.2f}")
                 button.on_click(lambda event, hit=hit: self.viewer.guarded(lambda: session.show_hit(hit), event.client))
                 self._hit_buttons.append(button)

@@ -20,9 +20,9 @@ def pick(gmap: Map, ids: np.ndarray, shown: np.ndarray, origin: np.ndarray, dire
     visible.
     """
     rows, weights = _weights(gmap, shown, origin, direction)
-    found, owner = np.unique(ids[rows], return_inverse=True)
-    total = np.where(found >= 0, np.bincount(owner.reshape(-1), weights, len(found)), 0)
-    return int(found[total.argmax()]) if total.max(initial=0) >= SEEN else None
+    known, owner = np.unique(ids[rows], return_inverse=True)
+    total = np.where(known >= 0, np.bincount(owner.reshape(-1), weights, len(known)), 0)
+    return int(known[total.argmax()]) if total.max(initial=0) >= SEEN else None
 
 
 def pick_point(gmap: Map, shown: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:

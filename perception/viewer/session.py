@@ -68,9 +68,9 @@ class Session:
     def ask(self, text: str, top_k: int = 5) -> list[Hit]:
         """Ranked hits, which are then highlighted; empty when the text is not present. None is hidden."""
         hidden = {entry["id"] for entry in self.editor.instances if entry.get("hidden")}
-        found = self._loaded().query(text, top_k + len(hidden))
+        hits = self._loaded().query(text, top_k + len(hidden))
         self.question = " ".join(text.split())
-        self.hits = [hit for hit in found if hit.instance_id not in hidden][:top_k]
+        self.hits = [hit for hit in hits if hit.instance_id not in hidden][:top_k]
         self.select(None)
         for hit in self.hits[:1]:
             self.show_hit(hit)

@@ -15,7 +15,7 @@ from perception import load_map
 from perception.errors import InputError
 from perception.node import answers
 from perception.query import QueryMap
-from perception.query.standing import Stand
+from perception.query.robot_pose import RobotPose
 from support.node_maps import encoders, write_small_map
 from support.paths import REPOSITORY
 
@@ -107,7 +107,7 @@ def test_a_place_to_stand_is_a_goal_that_looks_ahead() -> None:
     robot = Rotation.from_euler("z", 2.0)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = robot.as_matrix(), [1.0, -2.0, 0.25]
-    stand = Stand(4, pose, 0.5, 0.75, "home")
+    stand = RobotPose(4, pose, 0.5, 0.75, "home")
     fields = {"pose": messages.stand_pose(stand, STAMP), "distance": stand.distance, "seen": stand.seen}
     told = sent("perception_msgs/srv/WhereToStand_Response", fields)
     assert (told.error, told.distance, told.seen, told.pose.header.frame_id) == ("", 0.5, 0.75, "home")

@@ -195,3 +195,15 @@ def test_random_edits_are_read_or_told(original: Path, name: str, data: bytes) -
         assert str(original) in str(error) and "\n" not in str(error) and len(str(error)) < 1000
     finally:
         (original / name).write_text(good)
+
+
+def test_a_map_reads_a_field_once_and_keeps_what_it_is_given(path: Path) -> None:
+    """From disk at the first use; `of` shares what is there, changes the rest, and reads nothing."""
+    opened = Map.open(path)
+    named = Map.of(opened, info={"frame": "hall"})
+    assert "means" not in vars(opened) and "means" not in vars(named) and named.map_id == opened.map_id
+    assert named.frame == "hall" != opened.frame and opened.means is opened.means
+    np.testing.assert_array_equal(named.means, read_map(path).means)
+    assert Map.of(opened).means is opened.means and Map(means=opened.means).instances == []
+    with pytest.raises(AttributeError, match="without quats"):
+        _ = Map(means=opened.means).quats

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from perception import load_map
 from perception.map.write import write_map
-from perception.query.standing import where_to_stand
+from perception.query.robot_pose import where_to_stand
 from support.box_rooms import FURNISHED, map_of
 from support.node_maps import encoders, write_small_map
 from support.paths import REPOSITORY, SUPPORT, TESTS

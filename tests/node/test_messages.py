@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from perception.node import answers
-from perception.query.requests import Reply
 from perception.serve.engine import QueryEngine
+from perception.serve.requests import Reply
 from perception.types import OrientedBox
 from support.node_maps import encoders, write_small_map
 from support.paths import REPOSITORY, SUPPORT, TESTS

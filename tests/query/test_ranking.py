@@ -270,7 +270,7 @@ def test_shapes_add_by_kind_and_only_where_named(scene: tuple[Table, list[Instan
     box = _z(shaped.rank("box").hits) - _z(flat.rank("box").hits)
     assert np.allclose(box, [0, 1.5, 0, -2], atol=1e-6)  # a wall is no household thing
     assert shaped.rank("vague prompt").hits == flat.rank("vague prompt").hits
-    assert flat.shapes is None and shaped.over(things, shapes).rank("box").hits == shaped.rank("box").hits
+    assert flat.shapes is None and shaped.over(things).rank("box").hits == flat.rank("box").hits
 
 
 def test_canonical_phrases_cap_what_they_fit_better() -> None:

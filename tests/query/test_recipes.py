@@ -23,7 +23,7 @@ pytest.importorskip("starlette", reason="the extra 'serve' is not installed")
 from perception.cli import build_parser
 from perception.io.cloud import read_cloud
 from perception.map.write import read_map
-from perception.query.query_map import load_map
+from perception.query import load_map
 from support.processes import served
 from support.synthetic_map import SIGMA
 

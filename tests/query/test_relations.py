@@ -9,7 +9,7 @@ import pytest
 
 from perception.language.description import InstanceDescription
 from perception.query.ranking import Ranker
-from perception.query.relations import Places, Relation, parse, ranked
+from perception.query.relations import LevelBoxes, Relation, parse, ranked
 
 
 @pytest.mark.parametrize(
@@ -46,12 +46,12 @@ BOXES = np.array(
 )
 
 
-def _desk() -> Places:
+def _desk() -> LevelBoxes:
     """Seen by three cameras at y = -2 that look along +y, x to the right."""
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, :3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]  # right = x, down = -z, ahead = y
     poses[:, :3, 3] = [[-x, 0.8, 2] for x in (0.2, 0.8, 1.2)]
-    return Places(BOXES[:, 0], BOXES[:, 1], poses)
+    return LevelBoxes(BOXES[:, 0], BOXES[:, 1], poses)
 
 
 ON = {("book", "desk"), ("mug", "book"), ("lamp", "desk")}
@@ -83,7 +83,7 @@ def test_relations_of_a_made_desk(kind: str, pairs: set[tuple[str, str]]) -> Non
 
 def test_beside_is_near_and_not_stacked() -> None:
     lows = np.array([[0.0, 0, 0], [0.15, 0, 0], [0, 0, 0.2], [3, 0, 0]])
-    match = Places(lows, lows + np.array([0.1, 0.1, 0.2]), np.zeros((0, 4, 4))).match("beside")
+    match = LevelBoxes(lows, lows + np.array([0.1, 0.1, 0.2]), np.zeros((0, 4, 4))).match("beside")
     assert match[0, 1] == match[1, 0] == pytest.approx(1, abs=0.2) and match[0, 2] == match[2, 0] == match[0, 3] == 0
 
 
@@ -114,7 +114,7 @@ def thing(axis: int) -> InstanceDescription:
 def test_the_place_decides_between_equals_and_an_absent_other_changes_nothing() -> None:
     ranker = Ranker([thing(0), thing(0), thing(1)], Axes())
     lows = np.array([[0.0, 0, 0], [3, 0, 0], [3.5, 0, 0]])
-    places = Places(lows, lows + np.array([0.3, 0.3, 0.2]), np.zeros((0, 4, 4)))
+    places = LevelBoxes(lows, lows + np.array([0.3, 0.3, 0.2]), np.zeros((0, 4, 4)))
     answer = ranked(ranker, places, "book next to the lamp")
     assert answer.text == "book next to the lamp" and [n for n, _ in answer.hits][:1] == [1] and answer.present
     plain = ranker.rank("book")
@@ -126,7 +126,7 @@ def test_relations_may_be_chained() -> None:
     """Both books stand next to a lamp; one lamp stands next to the shelf."""
     ranker = Ranker([thing(axis) for axis in (0, 0, 1, 1, 3)], Axes())
     lows = np.array([[0.0, 0, 0], [6.0, 0, 0], [0.5, 0, 0], [6.5, 0, 0], [7.0, 0, 0]])
-    places = Places(lows, lows + np.array([0.3, 0.3, 0.2]), np.zeros((0, 4, 4)))
+    places = LevelBoxes(lows, lows + np.array([0.3, 0.3, 0.2]), np.zeros((0, 4, 4)))
     hits = dict(ranked(ranker, places, "book next to the lamp next to the shelf").hits)
     assert hits[1] > hits[0] and hits[1] == max(hits.values())
     once = dict(ranked(ranker, places, "book next to the lamp").hits)

@@ -21,7 +21,7 @@ from perception.language.base import Part, Reading
 from perception.language.colors import palette
 from perception.language.description import to_arrays
 from perception.map.write import Map, read_map, set_labels, write_map
-from perception.query import QueryMap, Where, load_map
+from perception.query import Where, load_map
 from perception.query.indexing import index_maps
 from perception.serve.engine import QueryEngine
 from support.query_maps import NAMES, HashEncoder, encoders, write_map_of
@@ -280,7 +280,6 @@ def test_damage_is_told_in_one_line(maps: list[Path], tmp_path: Path) -> None:
 
 def test_what_needs_one_map_says_so(store: Path) -> None:
     opened = perception.load_map(store, encoders)
-    assert isinstance(opened, QueryMap)
     for question in (
         lambda: opened.nearest([0, 0, 0]),
         lambda: opened.find(),
@@ -331,7 +330,7 @@ def test_a_server_answers_from_a_store_and_takes_over_a_new_one(maps: list[Path]
     from starlette.testclient import TestClient
 
     from perception.serve.app import build_app
-    from perception.serve.server import ServeSettings
+    from perception.serve.requests import ServeSettings
 
     index_maps(tmp_path / "s", maps[1:3], encoders=encoders)
     with QueryEngine(tmp_path / "s", encoders=encoders, watch=None) as engine:

@@ -21,8 +21,8 @@ from perception.errors import InputError
 from perception.io.atomic import atomic_file
 from perception.map.write import read_map, set_labels, write_map
 from perception.query import QueryMap, Where, load_map
-from perception.query.requests import AnswerTimeout, EngineBusy, EngineClosed, Request
 from perception.serve.engine import QueryEngine
+from perception.serve.requests import AnswerTimeout, EngineBusy, EngineClosed, Request
 from support.query_maps import NAMES, HashEncoder, encoders, write_map_of
 
 

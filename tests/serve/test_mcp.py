@@ -45,7 +45,7 @@ HEAD = (
 STDIO = HEAD + "from perception import cli\nserve = m.serve_stdio\n"
 STDIO += "m.serve_stdio = lambda path, photos: serve(path, encoders, photos)\n"
 STDIO += "sys.exit(cli.main(['mcp', *sys.argv[1:]]))\n"
-HTTP = HEAD + "from perception.serve.server import ServeSettings\n"
+HTTP = HEAD + "from perception.serve.requests import ServeSettings\n"
 HTTP += "m.serve_http(Path(sys.argv[1]), ServeSettings(port=0, token=sys.argv[2] or None, timeout=60), encoders)\n"
 RED = 4
 

@@ -31,7 +31,8 @@ from perception.query import QueryMap
 from perception.serve.app import build_app
 from perception.serve.engine import QueryEngine
 from perception.serve.listening import check_address, is_local, read_token
-from perception.serve.server import ServeSettings, serve
+from perception.serve.requests import ServeSettings
+from perception.serve.server import serve
 
 TOKEN = "0123456789abcdef0123"
 

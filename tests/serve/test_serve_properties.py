@@ -19,7 +19,7 @@ from starlette.testclient import TestClient
 
 from perception.serve.app import build_app
 from perception.serve.engine import QueryEngine
-from perception.serve.server import ServeSettings
+from perception.serve.requests import ServeSettings
 
 EXAMPLES = settings(max_examples=120, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
 SIZES = [0.0, -0.0, 1.0, 5e-324, 1e-200, 1e-9, 1e9, 1e12, -1e12, 1e38, 1e200, -1e200, 1e308, 10**400, 2**63]

@@ -19,7 +19,7 @@ def hears_ctrl_c() -> None:
 
 SERVER = (
     "import sys; from pathlib import Path; from support.query_maps import encoders\n"
-    "from perception.serve.server import ServeSettings, serve\n"
+    "from perception.serve.requests import ServeSettings; from perception.serve.server import serve\n"
     "serve(Path(sys.argv[1]), ServeSettings(port=int(sys.argv[2]), timeout=5), encoders=encoders)\n"
 )
 

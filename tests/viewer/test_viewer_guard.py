@@ -134,7 +134,8 @@ def test_other_machines_need_a_token_file(tmp_path: Path, capsys: pytest.Capture
 
 
 def test_a_viser_that_starts_its_server_otherwise_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    from perception.viewer.guard import Guard, guarded_server
+    from perception.serve.listening import Guard
+    from perception.viewer.handshake import guarded_server
 
     class Other:
         def __init__(self, **_: Any) -> None:
@@ -147,5 +148,5 @@ def test_a_viser_that_starts_its_server_otherwise_is_refused(monkeypatch: pytest
     made: list[Other] = []
     monkeypatch.setattr(viser, "ViserServer", Other)
     with pytest.raises(InputError, match="cannot be guarded"):
-        guarded_server(Guard(TOKEN, "127.0.0.1"), None)  # type: ignore[arg-type]
+        guarded_server(Guard("127.0.0.1", TOKEN), None)  # type: ignore[arg-type]
     assert made[0].stopped

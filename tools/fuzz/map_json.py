@@ -135,7 +135,7 @@ def _served(folder: Path) -> None:
     from perception.serve.app import build_app, encode
     from perception.serve.engine import QueryEngine
     from perception.serve.mcp import TOOLS, make_server, parse
-    from perception.serve.server import ServeSettings
+    from perception.serve.requests import ServeSettings
 
     with QueryEngine(folder / "a.gsmap", watch=None, workers=1) as engine:
         build_app(engine, ServeSettings())
@@ -292,7 +292,7 @@ class MapJson:
             return ColorEncoder() if spec in ("conse", "auto") else encoders.make_encoder(spec)
 
         options = {"encoders": make, "progress": QUIET}
-        modules = ("query.text_ranking", "query.map_store", "query.indexing", "query.engine")
+        modules = ("query.text_ranking", "query.map_store", "query.indexing", "serve.engine")
         with contextlib.ExitStack() as stack:
             for module in modules:
                 stack.enter_context(patch(f"perception.{module}.make_encoder", make))

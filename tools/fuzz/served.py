@@ -57,7 +57,7 @@ class HttpTarget:
     def __init__(self) -> None:
         from perception.serve.app import build_app
         from perception.serve.engine import QueryEngine
-        from perception.serve.server import ServeSettings
+        from perception.serve.requests import ServeSettings
         from support.query_maps import encoders, write_map_of
 
         self._folder = TemporaryDirectory(prefix="fuzz-")
@@ -256,11 +256,11 @@ class ViewerTarget:
     def __init__(self) -> None:
         from perception.map.files import map_signature
         from perception.map.write import read_map
-        from perception.viewer.guard import Guard
+        from perception.serve.listening import Guard
 
         self._folder = TemporaryDirectory(prefix="fuzz-", dir=in_memory())
         self._path = Path(self._folder.name, "m.gsmap")
-        self._guard = Guard("the token of this viewer", "127.0.0.1")
+        self._guard = Guard("127.0.0.1", "the token of this viewer")
         self._renew()
         opened = read_map(self._path)  # reading it for every input would be most of the time
 
@@ -339,6 +339,8 @@ class ViewerTarget:
         from websockets.datastructures import Headers
         from websockets.http11 import Request
 
+        from perception.viewer.handshake import refusal
+
         values = (
             "localhost:8090",
             "http://localhost:8090",
@@ -353,4 +355,4 @@ class ViewerTarget:
         for _ in range(dice.below(4)):
             headers[dice.pick(("Host", "Origin", "Cookie", "Upgrade"))] = dice.pick(values)
         path = dice.pick(("/", "/?token=x", "/?websocket=ws://evil", "/%ff?%ff", "//[", "?token=%ed%a0%80"))
-        assert self._guard(Request(path, headers)) is not None
+        assert refusal(self._guard, Request(path, headers)) is not None

@@ -3,8 +3,8 @@
     python tools score.relations [--scenes 20] [--first 100]
 
 Instances are the points of the truth that two photos see, without training. "on" is what the generator placed on what;
-"next to" is `Places`' measure on the true boxes, of things that stand on the same; "in" is a fruit in an open box that
-the script puts among the things.
+"next to" is `LevelBoxes`' measure on the true boxes, of things that stand on the same; "in" is a fruit in an open box
+that the script puts among the things.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from perception.io.cloud import read_cloud
-from perception.query.relations import Places
+from perception.query.relations import LevelBoxes
 from perception.query.scene_graph import MATCH, holders
 from worlds import make_photos
 
@@ -83,9 +83,9 @@ def _boxed(table: np.ndarray, others: list[np.ndarray], rng: np.random.Generator
     return np.concatenate([box, base]) + at, fruit + at
 
 
-def _places(clouds: list[np.ndarray]) -> Places:
+def _places(clouds: list[np.ndarray]) -> LevelBoxes:
     boxes = np.array([np.quantile(cloud, [0.02, 0.98], axis=0) for cloud in clouds])
-    return Places(boxes[:, 0], boxes[:, 1], np.empty((0, 4, 4)))
+    return LevelBoxes(boxes[:, 0], boxes[:, 1], np.empty((0, 4, 4)))
 
 
 if __name__ == "__main__":

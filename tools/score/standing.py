@@ -24,7 +24,7 @@ from perception.boxes import oriented_box
 from perception.errors import InputError
 from perception.query.floor_grid import HEIGHT, STEP
 from perception.query.query_map import QueryMap
-from perception.query.standing import where_to_stand
+from perception.query.robot_pose import where_to_stand
 from perception.types import View
 from worlds import room
 from worlds.light import Body, casters, first_hits

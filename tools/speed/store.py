@@ -124,7 +124,7 @@ def ask(store: Path, texts: list[str]) -> dict[str, Any]:
         seconds.append(time.perf_counter() - began)
         began = time.perf_counter()
         with torch_on_one_thread():
-            opened.ranker._encode([f"{text} thing"])  # the encoder may keep what it has seen
+            opened.ranker.encoder.embed([f"{text} thing"])  # the encoder may keep what it has seen
         encoding.append(time.perf_counter() - began)
         answers.append([(hit.map, hit.instance_id, hit.score) for hit in hits])
     return {
@@ -159,19 +159,20 @@ def vectors(store: Path, texts: list[str], folded: bool) -> tuple[np.ndarray, np
     ranker = opened.ranker
     keys = [
         (entry["map"], int(i))
-        for entry, own in zip(opened.maps, opened._slices, strict=True)
-        for i in opened._told["id"][own]
+        for entry, own in zip(opened.maps, opened._maps.slices, strict=True)
+        for i in opened._maps.records["id"][own]
     ]
-    asked = ranker._encode([without_color_words(text) for text in texts])
+    encoder = ranker.encoder
+    asked = encoder.embed([without_color_words(text) for text in texts])
     if not folded:
         rows = np.concatenate([load_map(Path(entry["map"])).language["embeddings"] for entry in opened.maps])
         return rows, asked, keys
-    middle, spread = ranker._null
-    rows = np.concatenate([*ranker._compared, -middle[:, None]], axis=1) / spread[:, None]
+    middle, spread = ranker.prepared.null.T
+    rows = np.concatenate([*ranker.prepared.compared, -middle[:, None]], axis=1) / spread[:, None]
     parts = []
-    for (place, references, weight), usual in zip(ranker._places, ranker._usual_spreads, strict=True):
-        unit = asked[:, place] / np.linalg.norm(asked[:, place], axis=1, keepdims=True)
-        parts.append(weight * unit * (usual / ranker._spreads(asked, place, references))[:, None])
+    for (columns, part), usual in zip(encoder.parts, encoder._usual, strict=True):
+        unit = asked[:, columns] / np.linalg.norm(asked[:, columns], axis=1, keepdims=True)
+        parts.append(part.weight * unit * (usual / encoder._spreads(asked, columns, part))[:, None])
     return rows.astype(np.float32), np.concatenate([*parts, np.ones((len(texts), 1))], axis=1).astype(np.float32), keys
 
 

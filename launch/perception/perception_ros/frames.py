@@ -38,8 +38,8 @@ class FrameFile(Settings):
             from perception.edit.scale import scaled
 
             held = scaled(gmap, self.scale)
-        made = QueryMap.of(held, info={**held.info, "frame": child, "metric": True})
-        made.encoders = gmap.encoders
+        info = {**held.info, "frame": child, "metric": True}
+        made = QueryMap.of(held, info=info, encoders=gmap.encoders)
         made.warm()
         return made
 

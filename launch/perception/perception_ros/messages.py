@@ -13,7 +13,7 @@ import numpy as np
 
 from perception.node.answers import Channel, Stamp, box_markers, header, pose, xyz, xyzw
 from perception.query import Frame, Hit, QueryMap
-from perception.query.standing import Stand
+from perception.query.robot_pose import RobotPose
 
 FIND = Channel("find", "perception_msgs/srv/Query")
 STAND = Channel("where_to_stand", "perception_msgs/srv/WhereToStand")
@@ -113,7 +113,7 @@ def occupancy_grid(
     }
 
 
-def stand_pose(stand: Stand, stamp: Stamp) -> Message:
+def stand_pose(stand: RobotPose, stamp: Stamp) -> Message:
     """geometry_msgs/PoseStamped of a robot that stands there: on the floor, x forward, z up (REP 103); a goal."""
     at = {"position": xyz(stand.position), "orientation": xyzw(stand.map_from_robot[:3, :3])}
     return {"header": header(stand.frame, stamp), "pose": at}

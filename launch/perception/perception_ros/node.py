@@ -28,18 +28,10 @@ from perception.node.core import Core
 from perception.node.ros import RosTransport, fill, message_class, spin, stop_on_signals
 from perception.query import Frame, QueryMap
 from perception.query.floor_grid import floor_grid
-from perception.query.requests import (
-    TOP,
-    AnswerTimeout,
-    EngineBusy,
-    EngineClosed,
-    Reply,
-    Request,
-    UnknownFrame,
-    error_kind,
-)
-from perception.query.standing import Stand, where_to_stand
+from perception.query.requests import TOP
+from perception.query.robot_pose import RobotPose, where_to_stand
 from perception.serve.engine import QueryEngine
+from perception.serve.requests import AnswerTimeout, EngineBusy, EngineClosed, Reply, Request, UnknownFrame, error_kind
 from perception_ros import messages
 from perception_ros.frames import FrameFile, read_frame
 
@@ -56,9 +48,9 @@ SWITCHES = {"autostart": "whether the node configures and activates itself"}
 class PlacedEngine(QueryEngine):
     """A query engine whose map lies in the child frame of a frame file."""
 
-    def __init__(self, path: Path, frames: FrameFile | None, **how: Any) -> None:
+    def __init__(self, path: Path, frames: FrameFile | None, **settings: Any) -> None:
         self._frames = frames
-        super().__init__(path, **how)
+        super().__init__(path, **settings)
 
     def open_map(self) -> QueryMap:
         gmap = super().open_map()
@@ -118,8 +110,8 @@ class Gate:
 class MapNode(LifecycleNode):
     """The lifecycle node. encoders: see QueryEngine."""
 
-    def __init__(self, encoders: Any = None, **how: Any) -> None:
-        super().__init__("node", namespace="perception", **how)
+    def __init__(self, encoders: Any = None, **options: Any) -> None:
+        super().__init__("node", namespace="perception", **options)
         self._encoders = encoders
         for name, text in TEXTS.items():
             self.declare_parameter(name, "", ParameterDescriptor(description=text))
@@ -250,30 +242,30 @@ class MapNode(LifecycleNode):
     def _stand(self, request: Any, response: Any) -> Any:
         """The service of perception_msgs/WhereToStand."""
 
-        def asked() -> Future[Any]:
+        def ask() -> Future[Any]:
             names = ("radius", "distance", "within", "sensor_height")
             lengths = {name: value for name in names if (value := float(getattr(request, name))) != 0}
             frame = self._frame(request.frame_id)
             return self._gate.run(lambda gmap: where_to_stand(gmap, request.instance_id, **lengths, frame=frame))
 
-        def answered(stand: Stand) -> dict[str, Any]:
+        def answered(stand: RobotPose) -> dict[str, Any]:
             pose = messages.stand_pose(stand, _now())
             return {"pose": pose, "distance": stand.distance, "seen": stand.seen}
 
-        return self._answer(response, asked, answered)
+        return self._answer(response, ask, answered)
 
     def _answer(self, response: Any, ask: Callable[[], Future[Any]], answered: Callable[[Any], dict[str, Any]]) -> Any:
         """The response of a service: the fields of what was asked for, or the kind of the error and why."""
         try:
-            found = answered(ask().result(self.config.timeout))
+            fields = answered(ask().result(self.config.timeout))
         except (InputError, EngineBusy, EngineClosed, AnswerTimeout, TimeoutError) as error:
             line = " ".join(str(error).split()) or "no answer in time"
             return fill(response, {"error": error_kind(error), "message": line})
-        return fill(response, found)
+        return fill(response, fields)
 
-    def _request(self, asked: Any) -> Request:
-        request = Request(asked.text, asked.top_k or TOP, float(asked.min_score) or None)
-        return replace(request, frame=self._frame(asked.frame_id))
+    def _request(self, query: Any) -> Request:
+        request = Request(query.text, query.top_k or TOP, float(query.min_score) or None)
+        return replace(request, frame=self._frame(query.frame_id))
 
     def _frame(self, name: str) -> Frame | None:
         """The frame of this name, None for the map's own; InputError when the node does not know it."""

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from perception.errors import InputError
 from perception.query import Frame
 from perception.query.floor_grid import HEIGHT
-from perception.query.query_map import UnknownInstance
-from perception.query.standing import CELL, Stand, where_to_stand
+from perception.query.requests import UnknownInstance
+from perception.query.robot_pose import CELL, RobotPose, where_to_stand
 from support.box_rooms import FURNISHED, Boxes, cast, points
 from support.box_rooms import map_of as room
 
@@ -41,7 +41,7 @@ def open_share(boxes: Boxes, number: int, place: np.ndarray) -> float:
     return float((cast([boxes[0], *others], eye, own - eye) > 1 - 1e-6).mean())
 
 
-def in_room(stand: Stand, map_from_room: np.ndarray) -> np.ndarray:
+def in_room(stand: RobotPose, map_from_room: np.ndarray) -> np.ndarray:
     """room_from_robot [4, 4]."""
     return np.linalg.inv(map_from_room) @ stand.map_from_robot
 

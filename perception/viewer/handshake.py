@@ -1,15 +1,14 @@
 """Access control of the viewer: checks every HTTP request and websocket handshake before viser handles it.
 
-Any web page in the same browser can open a connection to this machine, and viser accepts all of them. Three checks
-reject other clients: the Host header names this machine (against DNS rebinding), a websocket's Origin is the page that
-this server sent, and the browser sends the token. The token is in the printed address and is kept as a cookie.
+viser accepts all of them. Three checks reject other clients: the Host header names this machine, a websocket's Origin
+is the page that this server sent, and the browser sends the token (see `listening.Guard`). The token is in the printed
+address and is kept as a cookie.
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
-import hmac
 import io
 import re
 import socket
@@ -20,7 +19,7 @@ from typing import Any
 from urllib.parse import parse_qs, quote, unquote
 
 from perception.errors import InputError
-from perception.serve.listening import is_local, names_this_machine
+from perception.serve.listening import Guard, is_local
 
 _HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -37,34 +36,25 @@ _HOST = re.compile(r"([\w.-]+|\[[0-9a-fA-F:.]+\])(:\d{1,5})?", re.ASCII)
 _patching = threading.Lock()
 
 
-class Guard:
-    """Rejects requests before viser handles them. token: the access token; host: the address that is listened on."""
-
-    def __init__(self, token: str, host: str) -> None:
-        self._token, self._host = token.encode(), host
-
-    def __call__(self, request: Any) -> Any:
-        """The `websockets` Response that ends this request, or None when viser may answer it."""
-        host, origins = _only(request, "Host") or "", request.headers.get_all("Origin")
-        if not _HOST.fullmatch(host) or (is_local(self._host) and not names_this_machine(host, self._host)):
-            return _answer(HTTPStatus.FORBIDDEN, "the Host header does not name this machine")
-        if any(origin.partition("://")[2].lower() != host.lower() for origin in origins):
-            return _answer(HTTPStatus.FORBIDDEN, "a page of another origin may not connect")
-        cookie = f"perception_{host.rpartition(':')[2] if host[-1] != ']' and ':' in host else 80}"
-        query = request.path.partition("?")[2]
-        shown = parse_qs(query).get("token", [])
-        if shown and self._right(shown[0]):
-            kept = f"{cookie}={quote(shown[0], safe='')}; HttpOnly; SameSite=Lax; Path=/"
-            return _answer(HTTPStatus.SEE_OTHER, "", {"Location": "/", "Set-Cookie": kept})
-        if not any(self._right(value) for value in _cookies(request, cookie)):
-            return _answer(HTTPStatus.FORBIDDEN, "open the address with the token that perception view printed")
-        if query:
-            # viser's page connects to any server given by ?websocket=… and executes the messages from there.
-            return _answer(HTTPStatus.SEE_OTHER, "", {"Location": "/"})
-        return None
-
-    def _right(self, shown: str) -> bool:
-        return hmac.compare_digest(shown.encode("utf-8", "replace"), self._token)
+def refusal(guard: Guard, request: Any) -> Any:
+    """The `websockets` Response that ends this request, or None when viser may answer it."""
+    host, origins = _only(request, "Host") or "", request.headers.get_all("Origin")
+    if not _HOST.fullmatch(host) or (is_local(guard.host) and not guard.names_this_machine(host)):
+        return _answer(HTTPStatus.FORBIDDEN, "the Host header does not name this machine")
+    if any(origin.partition("://")[2].lower() != host.lower() for origin in origins):
+        return _answer(HTTPStatus.FORBIDDEN, "a page of another origin may not connect")
+    cookie = f"perception_{host.rpartition(':')[2] if host[-1] != ']' and ':' in host else 80}"
+    query = request.path.partition("?")[2]
+    shown = parse_qs(query).get("token", [])
+    if shown and guard.trusts(shown[0]):
+        kept = f"{cookie}={quote(shown[0], safe='')}; HttpOnly; SameSite=Lax; Path=/"
+        return _answer(HTTPStatus.SEE_OTHER, "", {"Location": "/", "Set-Cookie": kept})
+    if not any(guard.trusts(value) for value in _cookies(request, cookie)):
+        return _answer(HTTPStatus.FORBIDDEN, "open the address with the token that perception view printed")
+    if query:
+        # viser's page connects to any server given by ?websocket=… and executes the messages from there.
+        return _answer(HTTPStatus.SEE_OTHER, "", {"Location": "/"})
+    return None
 
 
 def _only(request: Any, name: str) -> str | None:
@@ -91,7 +81,7 @@ def _answer(status: HTTPStatus, line: str, headers: dict[str, str] | None = None
 
 
 def guarded_server(guard: Guard, sock: socket.socket, **settings: Any) -> Any:
-    """A viser.ViserServer that listens on `sock` and calls `guard` before it answers. settings: of ViserServer.
+    """A viser.ViserServer that listens on `sock` and asks `guard` before it answers. settings: of ViserServer.
 
     viser 1.1 has no such hook. It starts its server by `websockets.asyncio.server.serve`, which has two documented
     arguments: `process_request` is called with each request before a handshake, and `sock` is the socket to listen on.
@@ -122,9 +112,9 @@ def guarded_server(guard: Guard, sock: socket.socket, **settings: Any) -> Any:
 
 def _process_request(guard: Guard, inner: Callable[[Any, Any], Any] | None) -> Callable[[Any, Any], Any]:
     def process_request(connection: Any, request: Any) -> Any:
-        answer = guard(request)
-        if answer is None:
-            answer = inner(connection, request) if inner is not None else None
+        answer = refusal(guard, request)
+        if answer is None and inner is not None:
+            answer = inner(connection, request)
         if answer is not None:
             host = _only(request, "Host") or ""
             for name, value in _HEADERS.items():

@@ -1,0 +1,80 @@
+"""Instances of one kind as hits: those of a map, their parts, or groups of them."""
+
+from __future__ import annotations
+
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+
+from perception.colors import rgb8_from_sh
+from perception.map.map import InstanceIndex, Map, build_index
+from perception.query.hit import Hit
+from perception.types import OrientedBox
+
+
+class InstanceSet:
+    """entries: as in instances.json. language: as `Map.language`, a row per entry, or {}. ids [N] int32: the entry's id
+    of each Gaussian, −1 = none; None: the map's `instance_ids`. A `row` is the number of an entry."""
+
+    def __init__(
+        self, gmap: Map, entries: list[dict[str, Any]], language: dict[str, np.ndarray], ids: np.ndarray | None = None
+    ) -> None:
+        self.entries, self.language = entries, language
+        self._gmap, self._ids = gmap, ids
+        self._covariances: dict[int, np.ndarray] = {}
+
+    @cached_property
+    def index(self) -> InstanceIndex:
+        return self._gmap.index if self._ids is None else build_index(self._gmap.means, self._ids)
+
+    def hit(self, row: int, score: float | None = None) -> Hit:
+        """Entry `row` as a Hit; score: the mapper's confidence when None."""
+        entry = self.entries[row]
+        number = int(entry["id"])
+        return Hit(
+            number,
+            float(entry["score"]) if score is None else score,
+            self.index.of(number),
+            np.array(entry["centroid"], np.float64),
+            OrientedBox.from_json(entry["obb"]),
+            entry.get("label"),
+            self.views(row),
+            self._covariance(row),
+            self._gmap.frame,
+            colors=partial(self._colors, number),
+        )
+
+    def views(self, row: int) -> tuple[str, ...]:
+        """Names of the views that show the entry best, best first."""
+        if not self.language:
+            return ()
+        stop = int(self._view_stops[row])
+        names = self.language["view_names"][stop - int(self.language["view_counts"][row]) : stop]
+        return tuple(str(name) for name in names)
+
+    def best_box(self, row: int) -> tuple[int, int, int, int]:
+        """The box x0, y0, x1, y1 of the entry in the first of its `views`, pixels of the size used for training."""
+        start = int(self._view_stops[row]) - int(self.language["view_counts"][row])
+        x0, y0, x1, y1 = (int(value) for value in self.language["view_boxes"][start])
+        return x0, y0, x1, y1
+
+    @cached_property
+    def _view_stops(self) -> np.ndarray:
+        """[I] int64: one past the last row of each entry's views."""
+        return np.cumsum(self.language["view_counts"], dtype=np.int64)
+
+    def _covariance(self, row: int) -> np.ndarray:
+        """[3, 3] of the entry's points, computed once."""
+        if row not in self._covariances:
+            points = self.index.of(int(self.entries[row]["id"])).astype(np.float64)
+            centred = points - points.mean(axis=0) if len(points) else points
+            covariance = centred.T @ centred / max(len(points), 1)
+            covariance.setflags(write=False)
+            self._covariances[row] = covariance
+        return self._covariances[row]
+
+    def _colors(self, number: int) -> np.ndarray:
+        """Colours [P, 3] uint8 of the points of the entry with this id, in the order of `index`."""
+        ids = self._gmap.instance_ids if self._ids is None else self._ids
+        return rgb8_from_sh(self._gmap.sh[ids == number, 0])

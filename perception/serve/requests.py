@@ -1,0 +1,154 @@
+"""What all servers share: settings, errors and their kinds, `Request` and its answer `Reply`."""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import CancelledError
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import Field
+
+from perception.config import Settings
+from perception.errors import InputError
+from perception.query import Frame, Hit, QueryMap, Where
+from perception.query.requests import TOP, UnknownInstance, check_prompt
+
+MAX_TEXTS = 32
+MAX_BYTES = 64 << 10
+"""Largest request in bytes, JSON included; larger ones are rejected before parsing."""
+
+
+class EngineSettings(Settings):
+    """The settings of a `QueryEngine`, and so of every server."""
+
+    workers: int = Field(2, ge=1, le=64, description="queries answered at the same time")
+    queue_size: int = Field(64, ge=1, le=10_000, description="requests that may wait; more are refused")
+    timeout: float = Field(10.0, ge=1e-3, le=3600, description="seconds until a request is given up")
+    watch: float | None = Field(1.0, ge=0, le=3600, description="seconds between two looks for a new map; 0: never")
+
+    def of_engine(self) -> dict[str, Any]:
+        """The engine's own fields by name, for `QueryEngine(path, **…)`."""
+        return {name: getattr(self, name) for name in EngineSettings.model_fields}
+
+
+class ServeSettings(EngineSettings):
+    """How one process serves one map over HTTP. `serve` checks host and token."""
+
+    host: str = Field("127.0.0.1", description="where to listen")
+    port: int = Field(8765, ge=0, le=65535, description="0: any free one")
+    token: str | None = Field(None, description="clients send it as a bearer token; none only on this machine")
+    max_body: int = Field(MAX_BYTES, ge=1, description="bytes of a request")
+
+
+class OtherMap(InputError):
+    """The client's map_id is not that of the current map."""
+
+
+class UnknownFrame(InputError):
+    """No frame of this name is known."""
+
+
+class NoScale(InputError):
+    """Metres were asked of a map whose scale is not known."""
+
+
+class EngineBusy(RuntimeError):
+    """The request queue is full: retry later, or use another server.
+
+    >>> error_kind(EngineBusy("64 questions are waiting already; ask again later"))
+    'busy'
+    """
+
+
+class AnswerTimeout(TimeoutError):
+    """No answer within the time-out; a request that had not started is dropped.
+
+    >>> error_kind(AnswerTimeout("no answer within 10 s"))
+    'timeout'
+    """
+
+
+class EngineClosed(RuntimeError):
+    """The engine has been closed.
+
+    >>> error_kind(EngineClosed("kitchen.gsmap: the engine has been closed"))
+    'closed'
+    """
+
+
+KINDS: dict[type[BaseException], str] = {
+    UnknownInstance: "unknown_instance",  # these four are InputErrors too, so they come before
+    OtherMap: "other_map",
+    UnknownFrame: "unknown_frame",
+    NoScale: "no_scale",
+    InputError: "bad_input",
+    EngineBusy: "busy",
+    TimeoutError: "timeout",
+    CancelledError: "timeout",
+    EngineClosed: "closed",
+}
+
+
+def error_kind(error: BaseException) -> str:
+    """The kind of an error. unknown_instance, other_map: ask again for ids; unknown_frame, no_scale, bad_input: change
+    the request; busy, timeout: retry later; closed: use another server; failed: a defect here."""
+    return next((kind for known, kind in KINDS.items() if isinstance(error, known)), "failed")
+
+
+def error_line(error: BaseException | str) -> str:
+    """An error's message as one line of valid Unicode."""
+    return " ".join(str(error).encode("utf-8", "backslashreplace").decode().split()) or type(error).__name__
+
+
+def source(gmap: QueryMap, frame: Frame | None = None) -> dict[str, Any]:
+    """The facts of the map in every answer: the frame of its coordinates, whether they are metres, the map's id. Frame
+    and metres of a store's answer are None, and are given with each hit."""
+    return {"frame": frame.name if frame else gmap.frame, "metric": gmap.metric, "map_id": gmap.map_id}
+
+
+@dataclass(frozen=True)
+class Request:
+    """One prompt with its filters; its coordinates and those of the reply are in `frame`, None = the map's.
+
+    InputError for an empty or overlong text, and for numbers out of range.
+
+    >>> Request("red mug", top_k=1, where=Where(max_size=0.6)).text
+    'red mug'
+    """
+
+    text: str
+    top_k: int = TOP
+    min_score: float | None = None
+    where: Where | None = None
+    frame: Frame | None = None
+
+    def __post_init__(self) -> None:
+        check_prompt(self.text, self.top_k, self.min_score)
+
+    def answered(self, gmap: QueryMap, since: float) -> Reply:
+        """The reply of one map; since: `time.monotonic()` when the request came."""
+        hits = gmap.query(self.text, self.top_k, self.min_score, where=self.where, frame=self.frame)
+        return Reply(self, tuple(hits), **source(gmap, self.frame), seconds=time.monotonic() - since)
+
+
+@dataclass(frozen=True)
+class Reply:
+    """The answer to a request, computed on the map map_id alone. seconds: from submission to answer. A store's frame
+    and metric are None.
+
+    >>> reply = Request("red mug").answered(perception.load_map("kitchen.gsmap"), time.monotonic())
+    >>> reply.to_json()["present"], reply.frame, reply.metric
+    (True, 'map', True)
+    """
+
+    request: Request
+    hits: tuple[Hit, ...]
+    map_id: str
+    frame: str
+    metric: bool
+    seconds: float
+
+    def to_json(self) -> dict[str, Any]:
+        """An entry of `results` in the JSON output."""
+        return {"text": self.request.text, "present": bool(self.hits), "hits": [hit.to_json() for hit in self.hits]}
