@@ -13,7 +13,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.geometry import align_similarity, camera_centres
 from perception.io.documents import DAMAGE
-from perception.photos.decode import exif_folder, open_photo
+from perception.photos.decode import GPS_FOLDER, exif_of, open_photo
 from perception.photos.depth import load_depth
 from perception.photos.lens import load_pycolmap
 from perception.types import View
@@ -147,14 +147,14 @@ def _finite(places: list[str]) -> np.ndarray:
 
 
 LEAST = 6  # photos with a position
-_GPS_FOLDER, _LATITUDE, _LONGITUDE, _ALTITUDE = 0x8825, 1, 3, 5  # EXIF tags; the values follow the references
+_LATITUDE, _LONGITUDE, _ALTITUDE = 1, 3, 5  # EXIF tags; the values follow the references
 
 
 def photo_position(photo: Path) -> np.ndarray | None:
     """Latitude and longitude in degrees and altitude in metres [3] from EXIF; None without them or out of range."""
     try:
         with open_photo(photo) as image:
-            tags = exif_folder(image, photo, _GPS_FOLDER)
+            tags = exif_of(image, photo, GPS_FOLDER)
         angles = []
         for tag, negative in ((_LATITUDE, "S"), (_LONGITUDE, "W")):
             degrees, minutes, seconds = (float(x) for x in tags[tag + 1])

@@ -7,7 +7,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from perception.photos.decode import exif_folder, exif_of, open_photo, photo_size
+from perception.photos.decode import CAMERA_FOLDER, exif_of, open_photo, photo_size
 from perception.photos.lens import load_pycolmap
 from perception.progress import Progress
 from perception.types import Lens
@@ -84,8 +84,7 @@ def _drop_poor(database: Path, names: list[str]) -> list[str]:
 def _camera_key(photo: Path) -> tuple[Any, ...]:
     """Key of photos that share one camera: size, and EXIF maker, model, focal length and zoom."""
     with open_photo(photo) as image:
-        exif = exif_of(image, photo)
-        details = exif_folder(image, photo, 0x8769)
+        exif, details = exif_of(image, photo), exif_of(image, photo, CAMERA_FOLDER)
     return (*photo_size(photo), exif.get(0x010F), exif.get(0x0110), details.get(0x920A), details.get(0xA404))
 
 

@@ -22,7 +22,7 @@ from perception.bags.read import decode_image
 from perception.errors import InputError
 from perception.evaluate.images import read_rgb
 from perception.io.arrays import map_npy, read_npz
-from perception.masks.label_images import read_labels, stored_key
+from perception.masks.label_files import read_labels, stored_key
 from perception.onnx.sessions import open_session, side_files
 from perception.photos.decode import read_photo, why_left_out
 from perception.photos.depth import read_depth
