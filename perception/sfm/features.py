@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -88,7 +89,7 @@ def _camera_key(photo: Path) -> tuple[Any, ...]:
     return (*photo_size(photo), exif.get(0x010F), exif.get(0x0110), details.get(0x920A), details.get(0xA404))
 
 
-def match(database: Path, chosen: list[tuple[str, str]], seed: int, progress: Progress) -> None:
+def match(database: Path, chosen: Sequence[Sequence[str]], seed: int, progress: Progress) -> None:
     """Matches and verifies the chosen pairs of photos, given by their names in the database."""
     pycolmap = load_pycolmap()
     progress.update("poses: matching", 0, len(chosen))
