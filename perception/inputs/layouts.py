@@ -74,12 +74,10 @@ def _color_folder(source: Path) -> Path | None:
 
 def refuse_depth_without_poses(source: Path) -> None:
     """InputError for a folder of photos that holds 16-bit depth images, which would be taken for photos."""
-    first = next(iter(sorted((source / "depth").glob("*.png"))), None)
-    if first is None:
-        return
-    with open_photo(first) as image:
-        is_depth = image.mode.startswith("I")
-    if is_depth:
+    for first in sorted((source / "depth").glob("*.png"))[:1]:
+        with open_photo(first) as image:
+            if not image.mode.startswith("I"):
+                return
         raise InputError(
             f"{source}: has depth images but no poses; expected transforms.json with depth_file_path, groundtruth.txt "
             "(TUM), pose/*.txt (ScanNet) or a trajectory *.log (Redwood); to map the photos alone, give their folder"
@@ -93,12 +91,11 @@ def _tum(source: Path) -> Recording:
         raise InputError(f"{truth}: missing, so depth has no poses; expected lines 'time tx ty tz qx qy qz qw'")
     (at, photos), (depth_at, depths) = (_listed(source / name) for name in ("rgb.txt", "depth.txt"))
     rows = _numbers(truth, 8)
-    rows = rows[np.argsort(rows[:, 0], kind="stable")]
-    if (np.linalg.norm(rows[:, 4:], axis=1) < 1e-6).any():
+    times, shifts, quaternions = np.split(rows[np.argsort(rows[:, 0], kind="stable"), :8], [1, 4], axis=1)
+    if (np.linalg.norm(quaternions, axis=1) < 1e-6).any():
         raise InputError(f"{truth}: a quaternion is zero; expected lines 'time tx ty tz qx qy qz qw'")
-    times, poses = rows[:, 0], np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:8]).as_matrix()
-    poses[:, :3, 3] = rows[:, 1:4]
+    times, poses = times[:, 0], np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = Rotation.from_quat(quaternions).as_matrix(), shifts
     nearest = np.abs(depth_at[None] - at[:, None]).argmin(axis=1)
     apart = np.abs(depth_at[nearest] - at)
     if apart.min() > TUM_APART:

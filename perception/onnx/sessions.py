@@ -80,7 +80,7 @@ def _weights(path: Path) -> list[str]:
     if path.stat().st_size:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
             for match in _LOCATION.finditer(data):
-                size = sum((byte & 127) << 7 * place for place, byte in enumerate(match[1]))
+                size = sum((byte & 127) << 7 * number for number, byte in enumerate(match[1]))
                 names[data[match.end() : match.end() + min(size, _LONGEST)].decode("utf-8", "replace")] = None
     return list(names)
 
@@ -96,12 +96,9 @@ def _lies_beside(path: Path, name: str) -> bool:
 
 def read_config(model: Path, name: str) -> dict[str, Any]:
     """A JSON file in the model's folder or its parent (graphs often lie in `onnx/`); {} if there is none."""
-    for folder in (model.parent, model.parent.parent):
-        path = folder / name
-        if path.is_file():
-            known = read_json(path)
-            return known if isinstance(known, dict) else {}
-    return {}
+    path = next((folder / name for folder in model.parents[:2] if (folder / name).is_file()), None)
+    known = None if path is None else read_json(path)
+    return known if isinstance(known, dict) else {}
 
 
 def open_session(path: Path, threads: int = 0) -> Any:
@@ -162,8 +159,8 @@ def shape_of(value: Any) -> list[int | None]:
 
 def signature(session: Any) -> str:
     """Inputs and outputs with their shapes, for messages."""
-    inputs = ", ".join(f"{value.name}{value.shape}" for value in session.get_inputs())
-    outputs = ", ".join(f"{value.name}{value.shape}" for value in session.get_outputs())
+    sides = (session.get_inputs(), session.get_outputs())
+    inputs, outputs = (", ".join(f"{value.name}{value.shape}" for value in side) for side in sides)
     return f"inputs {inputs}; outputs {outputs}"
 
 

@@ -25,8 +25,6 @@ VARIES, REMAINS = 0.03, 0.7
 """Gains are used if the standard deviation of their logarithms is above VARIES, and if they leave at most the share
 REMAINS of the differences between colours of the same point. Read: 0.2 and 0.45 in an RGB-D camera's walk, where gains
 are worth 0.8 dB; 0.1 and 0.8 with a phone that also maps tones locally, 0.1 dB; 0.005 and 0.99 with fixed exposure."""
-
-
 LEAST = 30
 """Observations of points that another photo sees as well, for gains to be judged."""
 

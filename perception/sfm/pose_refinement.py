@@ -63,15 +63,12 @@ def checked_poses(views: list[View], features: Features, mode: str) -> tuple[lis
     side = max(max(lens.width, lens.height) for lens in map(view_lens, views))
     before, good = _medians(features, given), TOLERANCE * max(1.0, side / TOLERANCE_SIDE)
     facts: dict[str, Any] = {"refined": False, "given_error_px": before}
-    report: dict[str, Any] = {
-        "poses": facts,
-        "notes": [f"given poses: matched features {_text(before)}"],
-        "warnings": [],
-    }
+    notes, warnings = [f"given poses: matched features {_text(before)}"], list[str]()
+    report = {"poses": facts, "notes": notes, "warnings": warnings}
     usable, unit = views, _depth_unit(features, given)
     if not 1 / UNIT < unit < UNIT:
         what = f"features triangulate at {unit:.3g} times their measured depth, as if in another unit than the poses"
-        report["warnings"] = [f"{what}; depth is not used"]
+        warnings.append(f"{what}; depth is not used")
         usable, features = [replace(v, depth=None) for v in views], replace(features, depth=0 * features.depth)
     if mode == "auto" and before["epipolar"] <= good:
         return usable, report
@@ -80,10 +77,10 @@ def checked_poses(views: list[View], features: Features, mode: str) -> tuple[lis
     if after["epipolar"] <= min(IMPROVED * before["epipolar"], HOPELESS * good):
         changes, text = _changes(refined.since(given))
         facts |= {"refined": True, "error_px": after, **changes}
-        report["notes"].append(f"refined poses: {_text(after)}; {text}")
+        notes.append(f"refined poses: {_text(after)}; {text}")
         return [replace(v, camera_from_world=m) for v, m in zip(usable, refined.matrices(), strict=True)], report
     if before["epipolar"] <= HOPELESS * good:
-        report["notes"].append(f"refining them gains little ({_text(after)}); they are used as they are")
+        notes.append(f"refining them gains little ({_text(after)}); they are used as they are")
         return usable, report
     warning = "the given poses do not fit the photos, and refining them did not help; they are used as they are"
     return views, {**report, "warnings": [warning]}
