@@ -101,10 +101,8 @@ def write_depth(
     bag: Bag, topic: str, stamps: dict[str, int], lens: Lens, frame: str, poses: Poses, folder: Path
 ) -> tuple[dict[str, str], str]:
     """Writes the depth image nearest in time to each photo, 16-bit PNG in millimetres: file by photo, and a text.
-
     stamps: times of the photos in ns. lens, frame: of the photos. Depth of another frame or lens is registered by its
-    camera_info and tf; InputError where these are missing.
-    """
+    camera_info and tf; InputError where these are missing."""
     own = _depth_lens(bag, topic)
     times = np.array([stamp_of(message) or recorded for _, recorded, message in bag.messages([topic])])
     nearest = {name: int(np.abs(times - stamp).argmin()) for name, stamp in stamps.items()}

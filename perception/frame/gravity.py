@@ -114,10 +114,8 @@ def _solved(
 
 def _standard_error_of_roll(rolls: np.ndarray) -> float:
     """Of each of N rolls, such that their mean has the right error: neighbours in time are alike.
-
     Their spread times √(N / (n − 2)), n = N (1 − r) / (1 + r) independent rolls, from which two numbers are estimated;
-    r: correlation of neighbours (first-order autoregression).
-    """
+    r: correlation of neighbours (first-order autoregression)."""
     off = rolls - np.median(rolls)
     r = np.clip(float(off[1:] @ off[:-1]) / max(float(off @ off), 1e-12), 0, 0.95)
     spread = np.clip(1.4826 * np.median(np.abs(off)), np.radians(0.5), np.radians(10))

@@ -101,10 +101,8 @@ def scale_of_sightings(
     views: Sequence[View], sightings: Sequence[Sighting], pixel_error: float, source: str
 ) -> Measurement:
     """Metres per unit from things of known size; pixel_error: least standard deviation of their pixels.
-
     The standard error is the larger of two estimates: by random noise of the pixels, and by the jackknife over views,
-    which covers wrong poses, as these move all corners of a view together. InputError for corners of another shape.
-    """
+    which covers wrong poses, as these move all corners of a view together. InputError for corners of another shape."""
     poses = np.stack([view.camera_from_world for view in views])
     focal = float(np.median([np.sqrt(view.K[0, 0] * view.K[1, 1]) for view in views]))
     rng, usable = np.random.default_rng(0), []
@@ -145,10 +143,8 @@ def rays_of_pixels(view: View, pixels: np.ndarray) -> np.ndarray:
 
 def triangulated(poses: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """Points [K, 3] seen on rays [V, K, 2] (NaN: not seen) from poses [V, 4, 4]; NaN for less than two views.
-
     (x r₃ − r₁) · X = t₁ − x t₃, and for y likewise, with r, t the rows of [R | t]; weighted by 1 / depth, so that the
-    residual is that of the image (Hartley and Zisserman, Multiple View Geometry, 12.2).
-    """
+    residual is that of the image (Hartley and Zisserman, Multiple View Geometry, 12.2)."""
     seen = np.isfinite(rays).all(axis=2)
     used = seen.any(axis=1)
     poses, rays, seen = poses[used], np.where(seen[..., None], rays, 0.0)[used], seen[used]

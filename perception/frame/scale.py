@@ -191,10 +191,8 @@ def scale_of_gps(views: Sequence[View], seed: int = 0) -> tuple[Measurement | No
 
 def scale_of_positions(centres: np.ndarray, metres: np.ndarray, seed: int = 0) -> tuple[Measurement | None, list[str]]:
     """Metres per unit from camera centres [N, 3] and their measured positions [N, 3] with outliers, and notes.
-
-    The similarity metres = s R centres + t of least median residual over triples (LMedS) is refined on its inliers.
-    The standard error is a jackknife estimate over photos. An error that all photos share is not part of it.
-    """
+    The similarity metres = s R centres + t of least median residual over triples (LMedS) is refined on its inliers. The
+    standard error is a jackknife estimate over photos. An error that all photos share is not part of it."""
     inside = _inliers(centres, metres, np.random.default_rng(seed))
     count = int(inside.sum())
     if count < LEAST:

@@ -42,10 +42,8 @@ def is_workspace(folder: Path) -> bool:
 
 def read_workspace(folder: Path, options: ReadOptions) -> Scene:
     """The largest sparse model of a workspace as a Scene, in COLMAP's world.
-
     Photos that are missing or damaged are left out and reported. Image names that point outside the photo folder raise
-    InputError.
-    """
+    InputError."""
     found = {path: _read_model(path) for path in _models(folder)}
     path, model = max(found.items(), key=lambda item: item[1].num_reg_images())
     if model.num_reg_images() == 0:

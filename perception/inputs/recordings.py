@@ -42,10 +42,8 @@ class Frame:
 @dataclass(frozen=True)
 class Recording:
     """kind: for messages. frames: in order of time. lens: of all photos, None when the folder has no intrinsics.
-
     metre: stored units of depth per metre. depth_lens: of the depth camera, at the photo's pose; None when depth shows
-    what the photo shows. notes, warnings: one line each.
-    """
+    what the photo shows. notes, warnings: one line each."""
 
     source: Path
     kind: str

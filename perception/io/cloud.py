@@ -27,10 +27,8 @@ _PCD_COLUMNS = 1 << 12
 
 def read_cloud(path: str | Path) -> PointCloud:
     """Read .ply (cloud or mesh), .pcd or .npz.
-
-    points are float64 where the file stores doubles, else float32; integer columns besides the colours become
-    `labels`; faces of more than three corners are split into fans. NaN and infinite points are kept in place.
-    """
+    points are float64 where the file stores doubles, else float32; integer columns besides the colours become `labels`;
+    faces of more than three corners are split into fans. NaN and infinite points are kept in place."""
     path = Path(path)
     if path.suffix.lower() not in _FORMATS:
         raise InputError(f"{path}: unknown point cloud format '{path.suffix}'; expected {', '.join(_FORMATS)}")
@@ -40,11 +38,9 @@ def read_cloud(path: str | Path) -> PointCloud:
     cloud = _FORMATS[path.suffix.lower()][0](path)
     if len(cloud.points) == 0:
         raise InputError(f"{path}: holds no points")
-    if cloud.faces is not None and len(cloud.faces):
-        low, high = int(cloud.faces.min()), int(cloud.faces.max())
-        if low < 0 or high >= len(cloud.points):
-            bad = low if low < 0 else high
-            raise InputError(f"{path}: a face names vertex {bad}, but there are {len(cloud.points)} vertices")
+    bad = [] if cloud.faces is None else cloud.faces[(cloud.faces < 0) | (cloud.faces >= len(cloud.points))]
+    if len(bad):
+        raise InputError(f"{path}: a face names vertex {bad[0]}, but there are {len(cloud.points)} vertices")
     return cloud
 
 
@@ -89,7 +85,7 @@ def _cloud_of(columns: dict[str, np.ndarray], path: Path) -> PointCloud:
     if not set("xyz") <= columns.keys():
         raise InputError(f"{path}: has the fields {', '.join(columns)[:200] or 'none'}; expected x, y and z")
     points = np.stack([columns[axis] for axis in "xyz"], axis=1)
-    cloud = PointCloud(points if points.dtype == np.float64 else points.astype(np.float32))
+    cloud = PointCloud(_floats(points))
     colors, normals = (next((n for n in kinds if set(n) <= columns.keys()), None) for kinds in (_COLORS, _NORMALS))
     packed = next((columns[name] for name in ("rgb", "rgba") if name in columns), None)
     if colors is not None:
@@ -106,9 +102,12 @@ def _cloud_of(columns: dict[str, np.ndarray], path: Path) -> PointCloud:
     return cloud
 
 
+def _floats(points: np.ndarray) -> np.ndarray:
+    return points if points.dtype == np.float64 else points.astype(np.float32, copy=False)
+
+
 def _columns_of(cloud: PointCloud, normals: tuple[str, ...]) -> dict[str, np.ndarray]:
-    points = cloud.points if cloud.points.dtype == np.float64 else cloud.points.astype(np.float32)
-    columns = {axis: points[:, i] for i, axis in enumerate("xyz")}
+    columns = dict(zip("xyz", _floats(cloud.points).T, strict=True))
     if cloud.normals is not None:
         columns |= {name: cloud.normals[:, i].astype(np.float32) for i, name in enumerate(normals)}
     return columns
@@ -151,7 +150,7 @@ def _read_npz(path: Path) -> PointCloud:
     if points is None or points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
         found = "none" if points is None else f"{points.dtype} {list(points.shape)}"
         raise InputError(f"{path}: expected an array 'points' [P, 3], found {found}")
-    cloud = PointCloud(points if points.dtype == np.float64 else points.astype(np.float32, copy=False))
+    cloud = PointCloud(_floats(points))
     for name, values in arrays.items():
         if name == "colors" and values.shape == points.shape:
             cloud.colors = to_uint8(values)

@@ -1,4 +1,4 @@
-"""Arrays of which a bounded part is in memory: photos and labels of a large place."""
+"""Arrays of which a bounded part is in memory: photos and labels of a large scene."""
 
 from __future__ import annotations
 

@@ -45,10 +45,8 @@ class Table:
 
 def read_ply(path: str | Path) -> dict[str, Element]:
     """All elements of a PLY file: {element: {property: array}}, file order kept, native byte order.
-
-    A scalar property is an array [rows]; a list property is [rows, k] when all its lists have the same length
-    k and an object array of 1D arrays otherwise.
-    """
+    A scalar property is an array [rows]; a list property is [rows, k] when all its lists have the same length k and an
+    object array of 1D arrays otherwise."""
     path = Path(path)
     try:
         with path.open("rb") as file:

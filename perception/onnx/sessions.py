@@ -40,10 +40,8 @@ def model_root(folder: Path) -> Path:
 
 def model_graphs(folder: Path) -> tuple[list[Path], list[Path]]:
     """The ONNX files of a model folder and its subfolders (`onnx/`, `visual/`), and those left out.
-
     Of files that differ only in precision (`model.onnx`, `model_fp16.onnx`, `model_quantized.onnx`) the most precise
-    one is the model's. InputError where there is none.
-    """
+    one is the model's. InputError where there is none."""
     root, best = model_root(folder), dict[tuple[Path, str], Path]()
     found = sorted([*root.glob("*.onnx"), *root.glob("*/*.onnx")], key=lambda path: _PRECISIONS.index(_precision(path)))
     if not found:

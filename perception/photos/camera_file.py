@@ -24,10 +24,8 @@ def read_camera(path: Path) -> Lens:
 
 def lens_of(data: Any, where: object) -> Lens:
     """The lens of a camera_info; distortion models plumb_bob, rational_polynomial, equidistant.
-
     The centre of the first pixel is (0, 0) in ROS and OpenCV and (0.5, 0.5) in COLMAP and this project, so 0.5 is added
-    to the principal point. InputError that names `where` for values that are missing or describe no camera.
-    """
+    to the principal point. InputError that names `where` for values that are missing or describe no camera."""
     if not isinstance(data, dict):
         raise InputError(f"{where}: expected a ROS camera_info mapping with image_width, image_height, camera_matrix")
     width, height = (int(_numbers(data.get(key), 1, where, key)[0]) for key in ("image_width", "image_height"))

@@ -93,10 +93,8 @@ def why_left_out(path: Path, strict: bool = False) -> str | None:
 
 def read_photo(path: Path) -> np.ndarray:
     """The photo as uint8 [h, w, 3] RGB, rotated as in EXIF; (w, h) = photo_size(path).
-
     Grey is repeated to three channels, 16 bits become 8 (v / 257 rounded), palettes are expanded; transparent pixels
-    are composited on black. Floating-point images are refused. HEIC needs pillow-heif (extra "heic").
-    """
+    are composited on black. Floating-point images are refused. HEIC needs pillow-heif (extra "heic")."""
     with open_photo(path) as image:
         factor, (width, height) = _reduction(image), image.size
         if factor > 1:
@@ -127,10 +125,8 @@ def scaled_K(view: View, width: int, height: int) -> np.ndarray:
 
 def load_photo(view: View, max_side: int | None = None) -> np.ndarray:
     """The view's picture as uint8 [h, w, 3] RGB through its ideal pinhole, (w, h) = scaled_size(view, max_side).
-
     The photo is downscaled by area averaging, then undistorted with bilinear interpolation. Only the last warps are
-    cached. A photo is used without EXIF rotation if only then its size fits the camera (COLMAP ignores EXIF).
-    """
+    cached. A photo is used without EXIF rotation if only then its size fits the camera (COLMAP ignores EXIF)."""
     width, height = scaled_size(view, max_side)
     photo = _oriented(view)
     if view.lens is None:

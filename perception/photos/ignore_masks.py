@@ -27,10 +27,8 @@ def mask_of(folder: Path | None, name: str) -> Path | None:
 
 def read_mask(path: Path, width: int, height: int) -> np.ndarray:
     """[height, width] uint8, 255 = used, 0 = ignored; a mask of another resolution is sampled at the nearest pixel.
-
     Ignored are pixels that are black in all channels, or transparent. InputError for a file that is missing, no image,
-    or of another aspect ratio.
-    """
+    or of another aspect ratio."""
     image = read_picture(path, path, "mask; expected a PNG in which black (0) pixels are ignored")
     channels = image.reshape(*image.shape[:2], -1)
     used: np.ndarray = np.any(channels[..., :3] > 0, axis=2)
@@ -60,10 +58,8 @@ def stage_masks(folder: Path, photos: list[Path], names: list[str], masks: list[
 
 def with_checked_masks(scene: Scene, folder: Path | None) -> Scene:
     """The scene without the photos that their masks ignore completely, and a note on what is ignored.
-
     folder: of masks, as the user named it. InputError when it holds none for these photos, a mask is unreadable, or
-    nothing is left.
-    """
+    nothing is left."""
     masked = [view for view in scene.views if view.mask is not None]
     if folder is not None and not masked:
         raise InputError(

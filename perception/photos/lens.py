@@ -85,10 +85,8 @@ def rescale_lens(lens: Lens, width: int, height: int) -> Lens:
 @lru_cache(maxsize=256)
 def pinhole_from_lens(lens: Lens) -> tuple[tuple[float, float, float, float], int, int]:
     """(fx, fy, cx, cy), width, height of the pinhole image that `lens` undistorts to.
-
     As COLMAP's default: focal lengths are kept, the size is chosen so that no pixel is blank (0.2 to 2 times that of
-    the photo). Values of a lens without distortion are returned unchanged. InputError where undistortion fails.
-    """
+    the photo). Values of a lens without distortion are returned unchanged. InputError where undistortion fails."""
     ideal, plain, pycolmap = camera_from_lens(lens), is_pinhole(lens), load_pycolmap()
     try:
         ideal = ideal if plain else pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), ideal)

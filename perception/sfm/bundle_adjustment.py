@@ -77,10 +77,8 @@ def residuals(tracks: Tracks, poses: Poses, points: np.ndarray) -> tuple[np.ndar
 
 def adjust(tracks: Tracks, given: Poses, poses: Poses, prior: tuple[float, float]) -> Poses:
     """`poses` adjusted, together with the points of the tracks. given: the poses that the priors pull to.
-
     prior: standard errors of a given pose relative to that of the next view: angle in radians, centre in scene units.
-    The priors keep the world frame, and hold views that have no features.
-    """
+    The priors keep the world frame, and hold views that have no features."""
     points, priors = starting_points(tracks, poses), _priors(len(given.center), prior)
     for _ in range(ROUNDS):
         error, depth, _ = residuals(tracks, poses, points)

@@ -66,10 +66,8 @@ def model_warnings(models: list[Any], database: Path, photos: int) -> list[str]:
 
 def stronger_contradictions(pairs: list[Pair]) -> list[Pair]:
     """The contradicted pairs whose photos are not connected by agreeing pairs that are all at least as strong.
-
     Repeated textures also give verified pairs, so a contradicted pair alone is not an error. It is one if the model
-    depends on weaker pairs instead.
-    """
+    depends on weaker pairs instead."""
     connected, found = UnionFind(), []
     for pair in sorted(pairs, key=lambda p: (-p.inliers, not p.agrees)):
         if pair.agrees:

@@ -51,10 +51,8 @@ def _difference(logs: np.ndarray, usable: np.ndarray, tracks: Tracks) -> float:
 
 def photo_gains(logs: np.ndarray, usable: np.ndarray, tracks: Tracks, count: int) -> np.ndarray:
     """Logarithms of gains [count, 3], zero in the mean, that explain the logarithms of colours [O, 3] of the tracks.
-
     Minimises Σ ρ(|log c − a_point − g_photo|) by reweighted least squares; the a are eliminated. ρ is the Huber loss,
-    which is convex, and in the second half of the rounds the Cauchy loss. usable: [O] mask of observations.
-    """
+    which is convex, and in the second half of the rounds the Cauchy loss. usable: [O] mask of observations."""
     from scipy.sparse import csr_matrix, diags
     from scipy.sparse.linalg import spsolve
 

@@ -64,10 +64,8 @@ def _upper_half(weights: sparse.csr_matrix) -> np.ndarray:
 
 def with_overlap(submodels: list[list[int]], matches: Matches) -> list[list[int]]:
     """The photos of each submodel, and OVERLAP photos of each next to it, those that lead into it.
-
     Next to each other are the neighbours in the maximum spanning tree by the strongest pair of photos of two submodels:
-    submodels that only look alike are not.
-    """
+    submodels that only look alike are not."""
     submodel_of = {image: n for n, images in enumerate(submodels) for image in images}
     linked: dict[int, dict[int, int]] = {image: {} for image in submodel_of}
     graph = nx.Graph()

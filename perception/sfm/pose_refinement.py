@@ -52,10 +52,8 @@ def match_errors(features: Features, poses: Poses) -> tuple[np.ndarray, np.ndarr
 
 def checked_poses(views: list[View], features: Features, mode: str) -> tuple[list[View], dict[str, Any]]:
     """`views` as given or with refined poses, and the report's entries: "poses", "notes", "warnings".
-
     mode: "auto" refines poses that are worse than TOLERANCE, "refine" any that gain by it. Views that are held out for
-    scoring are refined as well, by features and depth alone.
-    """
+    scoring are refined as well, by features and depth alone."""
     given = poses_of(views)
     if len(features.pairs) < LEAST_MATCHES:
         note = f"given poses not checked: {len(features.pairs)} matched features, {LEAST_MATCHES} are needed"

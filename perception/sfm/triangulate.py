@@ -56,10 +56,8 @@ def triangulated_cloud(
     views: list[View], store: FeatureStore, seed: int
 ) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
     """points [P, 3] float64 in the world of the views, colors [P, 3] uint8, facts for the report.
-
     store: the matched features of the views (see sfm.database). With fewer than MIN_POINTS points, random points in the
-    view frusta are returned, with a warning.
-    """
+    view frusta are returned, with a warning."""
     pycolmap, model = load_pycolmap(), load_pycolmap().Reconstruction()
     with pycolmap.Database.open(store.database) as db:
         images = [db.read_image_with_name(name) for name in store.names]
