@@ -14,6 +14,7 @@ from perception.bags.read import CAMERA_INFO, DEPTH_TRANSPORT, IMAGES, Bag, came
 from perception.errors import InputError
 from perception.photos.camera_file import camera_info, lens_of
 from perception.photos.decode import read_picture
+from perception.photos.depth import measured
 from perception.photos.lens import camera_from_lens, rescale_lens
 from perception.types import Lens
 
@@ -73,9 +74,7 @@ def decode_depth(message: Any, where: str) -> np.ndarray:
             image = np.where(image > 0, a / (image.astype(np.float32) - b), 0).astype(np.float32)
     if image.ndim != 2:
         raise InputError(f"{where}: not a readable {what}")
-    metres = image.astype(np.float32) / (np.float32(1) if image.dtype.kind == "f" else np.float32(MILLIMETRES))
-    metres[~np.isfinite(metres) | (metres < 0) | ((image == 65535) & (image.dtype == np.uint16))] = 0
-    return metres
+    return measured(image) / np.float32(1 if image.dtype.kind == "f" else MILLIMETRES)
 
 
 def registered(depth: np.ndarray, own: Lens, color: Lens, color_from_depth: np.ndarray) -> np.ndarray:

@@ -80,9 +80,12 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
                 shutil.rmtree(aside / "depth", ignore_errors=True)
                 source_of_depth = f"left out: {error}"
             known, fixed = _camera_poses(poses, stamps, frame, options.fixed_frame)
-            down = None if fixed is None else gravity(bag, poses, fixed)
+            measured_down = None if fixed is None else gravity(bag, poses, fixed)
+            down, down_error = (None, None) if measured_down is None else (measured_down[0].tolist(), measured_down[1])
+            vertical = {"gravity": down, "gravity_std_deg": down_error}
             if fixed is not None:
-                _write_transforms(aside / "transforms.json", known, stamps, fixed, lens, depth, down)
+                data = {**_transforms(known, stamps, lens, depth), "world_frame": fixed, **(vertical if down else {})}
+                (aside / "transforms.json").write_text(json.dumps(data, indent=1), encoding="utf-8")
     facts = {
         "output": str(output),
         "topic": topic,
@@ -95,8 +98,7 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
         "camera_model": lens.model,
         "depth": source_of_depth,
         "with_depth": len(depth),
-        "gravity": None if down is None else down[0].tolist(),
-        "gravity_std_deg": None if down is None else down[1],
+        **vertical,
     }
     return facts, _text(facts)
 
@@ -157,17 +159,10 @@ def _camera_poses(
     return best, world
 
 
-def _write_transforms(
-    path: Path,
-    known: dict[str, np.ndarray],
-    stamps: dict[str, int],
-    fixed: str,
-    lens: Lens,
-    depth: dict[str, str],
-    down: tuple[np.ndarray, float] | None,
-) -> None:
-    """nerfstudio's format: only frames with a pose, OpenGL camera axes, pixel centres at +0.5, depth in millimetres.
-    "gravity" points down in the world; "gravity_std_deg" is its standard error in degrees."""
+def _transforms(
+    known: dict[str, np.ndarray], stamps: dict[str, int], lens: Lens, depth: dict[str, str]
+) -> dict[str, Any]:
+    """nerfstudio's format: frames with a pose, OpenGL camera axes, pixel centres at +0.5, depth in millimetres."""
     frames = [
         {
             "file_path": f"images/{name}",
@@ -177,16 +172,11 @@ def _write_transforms(
         }
         for name, pose in known.items()
     ]
-    fx, fy, cx, cy, *extra = lens.params
-    data: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE" if lens.model == "OPENCV_FISHEYE" else "OPENCV"}
-    data |= {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": lens.width, "h": lens.height}
-    data |= dict(zip(FISHEYE if lens.model == "OPENCV_FISHEYE" else PERSPECTIVE, extra, strict=False))
-    if depth:
-        data["depth_unit_scale_factor"] = 1 / MILLIMETRES
-    if down is not None:
-        data |= {"gravity": down[0].tolist(), "gravity_std_deg": down[1]}
-    facts = {"metric": True, "world_frame": fixed}  # ROS measures in metres (REP 103)
-    path.write_text(json.dumps({**data, **facts, "frames": frames}, indent=1), encoding="utf-8")
+    model, names = ("OPENCV_FISHEYE", FISHEYE) if lens.model == "OPENCV_FISHEYE" else ("OPENCV", PERSPECTIVE)
+    keys = ("fl_x", "fl_y", "cx", "cy", *names)
+    data = {"camera_model": model, "w": lens.width, "h": lens.height, **dict(zip(keys, lens.params, strict=False))}
+    unit = {"depth_unit_scale_factor": 1 / MILLIMETRES} if depth else {}
+    return {**data, **unit, "metric": True, "frames": frames}  # ROS measures in metres (REP 103)
 
 
 def _text(facts: dict[str, Any]) -> str:

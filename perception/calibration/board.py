@@ -134,7 +134,7 @@ class Board:
         """The board of "KIND:COLSxROWS:SQUARE[:MARKER[:DICTIONARY]]"; the marker is 3/4 of the square by default."""
         kind, squares, square, marker, dictionary = (*text.split(":"), *[""] * 5)[:5]
         try:
-            columns, rows = (int(word) for word in squares.lower().split("x"))
+            columns, rows = (int(side) for side in squares.lower().split("x"))
             side = float(square)
             return cls(kind, (columns, rows), side, float(marker or 0.75 * side), dictionary or "5X5_100")
         except ValueError as error:

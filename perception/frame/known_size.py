@@ -109,7 +109,7 @@ def scale_of_sightings(
     for thing in sightings:
         rays, residuals = _without_outliers(poses, thing.rays, pixel_error / focal)
         seen = np.isfinite(residuals)
-        freedom = max(int(seen.sum()) - 3 * len(thing.corners) - 2, 1)  # 2 less: few residuals tell the noise badly
+        freedom = max(int(seen.sum()) - 3 * len(thing.corners) - 2, 1)  # 2 less: few residuals underestimate the noise
         noise = max(pixel_error / focal, float(np.sqrt((residuals[seen] ** 2).sum() / freedom)))
         drawn = [_fitted(poses, thing.corners, rays + noise * rng.standard_normal(rays.shape)) for _ in range(DRAWS)]
         metres, off = _fitted(poses, thing.corners, rays)

@@ -21,16 +21,16 @@ from perception.types import Scene, View
 UNIT_IS_METRE, UNIT_OF_DEPTH = 0.03, 0.4
 """Largest deviation from 1, and largest standard error, at which a measured unit is taken as the metre as it is; the
 largest one, by depth images, from the metre that the input states at which those are used as they are."""
-SAMPLED = 200  # views whose depth images are read for the planes that tell gravity
+SAMPLED = 200  # views whose depth images are read for the planes that show gravity
 STATED = {"metres_per_unit": 1.0, "source": "the input, which states it", "standard_error": None}
 
 
 def in_world_frame(scene: Scene, options: FrameConfig, seed: int = 0) -> Scene:
-    """The scene in the map's frame; report["scale"], ["gravity"] and ["map_from_input"] tell how it was found.
+    """The scene in the map's frame, recorded in report["scale"], ["gravity"] and ["map_from_input"].
 
     A scene whose input has poses keeps its world unless `options.keep_world` is False: only the unit becomes the metre
     when `options` give a known size. Photos without poses get the map's frame as far as it is known: turned if the
-    standard error of gravity allows (`Gravity.confident`), in metres if something tells the scale. InputError for a
+    standard error of gravity allows (`Gravity.confident`), in metres if a scale is measured. InputError for a
     known size that is not seen.
     """
     posed = scene.report.get("input") != "photos"
@@ -89,7 +89,7 @@ def _unit(scene: Scene, options: FrameConfig, posed: bool, seed: int) -> tuple[b
     off, error = abs(np.log(scale.metres)), scale.standard_error / scale.metres
     if scene.metric:
         if off > 3 * error + UNIT_IS_METRE:
-            notes.append(f"the input says its unit is the metre, but it is {scale}")
+            notes.append(f"the input states that its unit is the metre, but it is {scale}")
         return True, scale, notes
     return posed and bool(max(off, error) <= UNIT_IS_METRE), scale, notes
 

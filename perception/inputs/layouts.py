@@ -36,21 +36,16 @@ _TEXTS = (
 _COLOR_FOLDERS = ("color", "image", "rgb")
 
 
-def is_recording(source: Path) -> bool:
-    """Whether folder `source` has one of the layouts."""
-    return _layout(source) is not None
-
-
 def open_recording(source: Path) -> Recording:
     """The recording in folder `source`. InputError for one that is damaged, or without a layout."""
-    read = _layout(source)
+    read = layout_of(source)
     if read is None:
         raise InputError(f"{source}: no RGB-D recording; expected the files of TUM, ScanNet, 7-Scenes or Redwood")
     return read(source)
 
 
-def _layout(source: Path) -> Callable[[Path], Recording] | None:
-    """What reads the layout that the folder has, recognised by its names; None where it has none."""
+def layout_of(source: Path) -> Callable[[Path], Recording] | None:
+    """The reader of the layout that the folder has, recognised by its names; None where it has none."""
     if (source / "rgb.txt").is_file() and (source / "depth.txt").is_file():
         return _tum
     if (source / "color").is_dir() and (source / "pose").is_dir():
@@ -130,11 +125,10 @@ def _scannet(source: Path) -> Recording:
     """Exported frames: color/, depth/ in mm, pose/ world_from_camera, infinite where tracking was lost."""
     photos = _images(source / "color")
     frames = _posed(source, photos, lambda photo, kind: source / kind / photo.stem)
-    intrinsics = source / "intrinsic"
     depth = next((frame.depth for frame in frames if frame.depth is not None), None)
-    own = None if depth is None else _matrix_lens(intrinsics / "intrinsic_depth.txt", photo_size(depth))
+    own = None if depth is None else _matrix_lens(source / "intrinsic/intrinsic_depth.txt", photo_size(depth))
     notes = _missing(len(photos) - len(frames), len(photos), "a pose (tracking was lost)")
-    lens = _matrix_lens(intrinsics / "intrinsic_color.txt", photo_size(photos[0]))
+    lens = _matrix_lens(source / "intrinsic/intrinsic_color.txt", photo_size(photos[0]))
     return Recording(source, "ScanNet", frames, lens, 1000.0, own, notes)
 
 
@@ -186,8 +180,7 @@ def _redwood(source: Path) -> Recording:
     poses = _trajectory(named[0], len(photos))
     frames = [Frame(f"{folder.name}/{photos[i].name}", photos[i], depths[i], pose) for i, pose in poses.items()]
     lens, notes = None, _missing(len(photos) - len(poses), len(photos), "a pose")
-    cameras = sorted(source.glob("*intrinsic*.json")) + sorted(source.glob("camera*.json"))
-    if cameras:
+    if cameras := sorted(source.glob("*intrinsic*.json")) + sorted(source.glob("camera*.json")):
         lens = _open3d_lens(cameras[0])
     elif photo_size(photos[0]) == _SIZE:
         lens = _lens(_PRIMESENSE, _SIZE)
@@ -235,8 +228,7 @@ def _rows(file: Path) -> list[list[str]]:
         lines = file.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{file}: cannot be read as text") from error
-    rows = [line.replace(",", " ").split() for line in lines if not line.lstrip().startswith("#")]
-    rows = [row for row in rows if row]
+    rows = [row for line in lines if (row := line.replace(",", " ").split()) and not row[0].startswith("#")]
     if not rows:
         raise InputError(f"{file}: is empty")
     return rows

@@ -11,7 +11,7 @@ from pathlib import Path
 from perception.errors import InputError
 from perception.inputs import recordings
 from perception.inputs.colmap import is_workspace, model_files, read_workspace
-from perception.inputs.layouts import is_recording, open_recording, refuse_depth_without_poses, text_files
+from perception.inputs.layouts import layout_of, open_recording, refuse_depth_without_poses, text_files
 from perception.inputs.transforms import is_transforms, listed_files, listed_photos, read_transforms, transforms_file
 from perception.photos import video
 from perception.photos.decode import photo_size
@@ -115,7 +115,7 @@ READERS = (
         cameras=True,
     ),
     Reader(
-        is_recording,
+        lambda source: layout_of(source) is not None,
         _recording_sizes,
         _recording_files,
         lambda source, options: recordings.recorded_scene(open_recording(source), options),

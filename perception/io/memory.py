@@ -86,7 +86,7 @@ def _new_file(folder: Path, size: int) -> mmap.mmap:
 
 
 def mapped_bytes() -> int:
-    """Bytes of mapped files that are resident in this process; very many where the system does not tell."""
+    """Bytes of mapped files that are resident in this process; very many where the system does not report it."""
     try:
         return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[2]) * mmap.PAGESIZE
     except OSError:

@@ -138,7 +138,7 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Table]]:
 
 
 class _Body:
-    """Values of a body, taken one after another. The numbers of a text are float64, whatever the header says."""
+    """Values of a body, taken one after another. The numbers of a text are float64, whatever their type."""
 
     def __init__(self, body: bytes, order: str):
         self.order, self.text, self.at = order, not order, 0
@@ -174,7 +174,7 @@ class _Body:
 
 
 def _cast(values: np.ndarray, kind: str) -> np.ndarray:
-    with np.errstate(invalid="ignore"):  # a text may hold nan where the header says int
+    with np.errstate(invalid="ignore"):  # a text may hold nan of type int
         return values.astype(kind)
 
 
@@ -196,7 +196,7 @@ def _read_element(source: _Body, table: Table, path: Path) -> Element:
 
 
 def _cut_short(path: Path, table: Table, found: int) -> str:
-    return f"{path}: is cut short: element '{table.name}' has {found} whole rows, header says {table.rows}"
+    return f"{path}: is cut short: element '{table.name}' has {found} complete rows, its header says {table.rows}"
 
 
 def _take_row(source: _Body, table: Table) -> Element:

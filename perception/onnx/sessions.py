@@ -68,19 +68,22 @@ def side_files(path: Path) -> list[Path]:
 
 def refuse_outside_weights(path: Path) -> None:
     """InputError for an ONNX file whose weights lie outside its folder, as no public export has them."""
-    outside = next((name for name in _weights(path) if not _lies_beside(path, name)), None)
-    if outside is not None:
-        raise InputError(f"{path}: its weights are in {outside[:200]!r}, outside its folder; expected a file beside it")
+    for name in _weights(path):
+        if not _lies_beside(path, name):
+            raise InputError(
+                f"{path}: its weights are in {name[:200]!r}, outside its folder; expected a file beside it"
+            )
 
 
-def _weights(path: Path) -> list[str]:
+def _weights(path: Path) -> dict[str, None]:
+    """Names of the files in order, each once."""
     names = dict[str, None]()
     if path.stat().st_size:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
             for match in _LOCATION.finditer(data):
                 size = sum((byte & 127) << 7 * number for number, byte in enumerate(match[1]))
                 names[data[match.end() : match.end() + min(size, _LONGEST)].decode("utf-8", "replace")] = None
-    return list(names)
+    return names
 
 
 def _lies_beside(path: Path, name: str) -> bool:
@@ -164,7 +167,7 @@ def signature(session: Any) -> str:
 
 def fingerprint(path: Path) -> str:
     """12 hex digits of the size, the first and the last MiB of a model and of its side files.
-    This distinguishes weights without reading the whole files, which can be gigabytes."""
+    This distinguishes weights without reading all of them, which can be gigabytes."""
     digest = hashlib.sha256()
     for part in (path, *side_files(path)):
         size = part.stat().st_size

@@ -79,7 +79,7 @@ def upright(image: Image.Image, path: Path) -> Image.Image:
 
 
 def why_left_out(path: Path, strict: bool = False) -> str | None:
-    """The error that reading the whole photo raises, or None; strict: raised. JPEG is read at 1/8 size: every byte."""
+    """The error that reading the photo raises, or None; strict: raised. JPEG is read at 1/8 size: every byte."""
     try:
         with open_photo(path) as image:
             image.draft("RGB", reduced_size(*image.size, 8))

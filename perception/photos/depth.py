@@ -22,7 +22,7 @@ _EDGE = 0.05
 
 
 def read_depth(path: Path) -> np.ndarray:
-    """The image [h, w] as stored, float32; 0 where nothing was measured (0, negative, NaN, infinite, saturated).
+    """The image [h, w] as stored, float32, 0 = nothing `measured`.
     InputError when the file is missing, damaged, empty or not of one channel."""
     if not path.is_file():
         raise InputError(f"{path}: no such depth image")
@@ -31,11 +31,13 @@ def read_depth(path: Path) -> np.ndarray:
         image = map_npy(path) if path.suffix.lower() == ".npy" else read_picture(path, path, what)
     if image.ndim != 2 or image.size == 0 or image.dtype.kind not in "uif":
         raise InputError(f"{path}: found {image.dtype} {list(image.shape)}, expected a depth image of one channel")
+    return measured(image)
+
+
+def measured(image: np.ndarray) -> np.ndarray:
+    """A depth image as float32, 0 where nothing was measured (0, negative, NaN, infinite, saturated)."""
     depth = image.astype(np.float32)
-    none = ~np.isfinite(depth) | (depth <= 0)
-    if image.dtype == np.uint16:
-        none |= image == SATURATED
-    depth[none] = 0
+    depth[~np.isfinite(depth) | (depth < 0) | ((image == SATURATED) & (image.dtype == np.uint16))] = 0
     return depth
 
 

@@ -57,10 +57,8 @@ def model_warnings(models: list[Any], database: Path, photos: int) -> list[str]:
         warnings.append(f"{wrong} and are stronger than the pairs it rests on: it may be folded (equal textures?)")
     unmatched, near = _unmatched_neighbors(best, {(pair.i, pair.j) for pair in pairs})
     if near >= 5 and unmatched > MAX_UNMATCHED * near:
-        warnings.append(
-            f"{unmatched} of {near} photo pairs that the model puts at one position, looking the same way, do not match"
-            ": it may be folded (equal textures?)"
-        )
+        alike = f"{unmatched} of {near} photo pairs that the model puts at one position, looking the same way"
+        warnings.append(f"{alike}, do not match: it may be folded (equal textures?)")
     return warnings
 
 

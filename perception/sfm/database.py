@@ -102,9 +102,5 @@ def _key(
 ) -> str:
     paths = [*photos, *(mask for mask in masks or () if mask is not None)]
     files = [(str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns) for path in paths]
-    extraction = (features.MAX_IMAGE_SIDE, features.MAX_FEATURES, features.MIN_FEATURES, features.PEAK_THRESHOLD)
-    constants: list[float] = [pairs.EXHAUSTIVE_BELOW, pairs.NEIGHBORS, pairs.COARSE_FEATURES, pairs.COARSE_MIN_MATCHES]
-    constants += [pairs.COARSE_RATIO, pairs.PARTNERS, features.MIN_INLIERS]
-    if len(photos) > pairs.RETRIEVED_ABOVE:
-        constants += [pairs.RETRIEVED_ABOVE, pairs.RETRIEVED, pairs.WORDS]
-    return hashlib.sha256(repr((files, lenses, extraction, constants, search)).encode()).hexdigest()[:12]
+    constants = [{name: of for name, of in vars(module).items() if name.isupper()} for module in (features, pairs)]
+    return hashlib.sha256(repr((files, lenses, constants, search)).encode()).hexdigest()[:12]

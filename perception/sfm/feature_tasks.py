@@ -121,13 +121,13 @@ def write_part(
     target.unlink(missing_ok=True)
     load_pycolmap().Database.open(target).close()  # creates its tables
     with closing(sqlite3.connect(target)) as part, part:
-        part.execute("ATTACH DATABASE ? AS whole", (str(database),))
+        part.execute("ATTACH DATABASE ? AS source", (str(database),))
         for table in _IMAGES:
-            part.execute(f"INSERT INTO {table} SELECT * FROM whole.{table}")
+            part.execute(f"INSERT INTO {table} SELECT * FROM source.{table}")
         part.execute("CREATE TEMP TABLE wanted (id INTEGER PRIMARY KEY)")
         part.executemany("INSERT INTO wanted VALUES (?)", [(image,) for image in sorted(set(images))])
         for table in tables:
-            part.execute(f"INSERT INTO {table} SELECT * FROM whole.{table} WHERE image_id IN wanted")
+            part.execute(f"INSERT INTO {table} SELECT * FROM source.{table} WHERE image_id IN wanted")
         if matched:
             both = " AND ".join(f"{image} IN wanted" for image in (f"pair_id / {_PAIR}", f"pair_id % {_PAIR}"))
-            part.execute(f"INSERT INTO two_view_geometries SELECT * FROM whole.two_view_geometries WHERE {both}")
+            part.execute(f"INSERT INTO two_view_geometries SELECT * FROM source.two_view_geometries WHERE {both}")

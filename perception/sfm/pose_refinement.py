@@ -100,7 +100,7 @@ def refine(features: Features, given: Poses) -> Poses:
 
 
 def moved_back(poses: Poses, given: Poses, distance: float) -> Poses:
-    """`poses` moved as a whole to where what the cameras see, at `distance`, lies as by the given ones.
+    """`poses` moved together to where what the cameras see, at `distance`, lies as by the given ones.
     Least sum of the displacements of five points ahead of each camera, by reweighting: the priors hold them loosely."""
     ahead = distance * np.array([[0, 0, 1], [0.4, 0, 1], [-0.4, 0, 1], [0, 0.4, 1], [0, -0.4, 1]])
     a, b = ((np.einsum("nji,kj->nki", p.rotation, ahead) + p.center[:, None]).reshape(-1, 3) for p in (poses, given))

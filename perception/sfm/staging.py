@@ -26,7 +26,7 @@ _FOCAL_LENGTH = (0x920A, 0xA405, 0xA20E, 0xA20F, 0xA210)
 def stage_photos(folder: Path, photos: list[Path], progress: Progress) -> list[str]:
     """Fills the new `folder`; returns the names there, in the order of `photos`, which is also their sorted order.
     Upright JPEG and PNG are linked. Others are written as PNG, which keeps the pixels of every 8-bit format (16 bits
-    become 8), with the EXIF data that tell the focal length, by several threads."""
+    become 8), with the EXIF data on the focal length, by several threads."""
     folder.mkdir()
     names, converted = [], []
     for index, photo in enumerate(photos):
