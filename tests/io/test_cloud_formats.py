@@ -151,6 +151,8 @@ GOOD = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty flo
         ("a.ply", b"ply\nformat ascii 1.0\n", "cut short"),
         ("a.ply", GOOD + b"end_header\n1 2\n", "cut short"),
         ("a.ply", GOOD + b"end_header\n1 two 3\n", "numbers are expected"),
+        ("a.ply", GOOD + b"end_header\n1 2 3 4\n", "more numbers"),
+        ("a.pcd", pcd("x y z", "4 4 4", "F F F", 1, "ascii") + b"1 2 3 4\n", "more numbers"),
         ("a.ply", GOOD.replace(b"ascii", b"binary_little_endian") + b"end_header\n\0\0", "0 complete rows"),
         ("a.ply", GOOD.replace(b"vertex 1", b"vertex 0") + b"end_header\n", "no points"),
         ("a.ply", GOOD.replace(b"float z", b"float w") + b"end_header\n1 2 3\n", "x, y and z"),
