@@ -32,7 +32,7 @@ def missing_extra(package: str, extra: str) -> InputError:
 
 
 def local_path(text: str) -> Path:
-    """The path that `text` names. InputError for a URL, of which only the scheme is told: URLs hold passwords."""
+    """The path that `text` names. InputError for a URL, which names only its scheme: URLs hold passwords."""
     if found := _URL.match(text):
         what = "is a URL, expected a path on this machine"
         raise InputError(f"{found.group()}…: {what}; copy it with `aws s3 sync` or `rclone`, or mount the store")

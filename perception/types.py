@@ -25,10 +25,8 @@ class Lens:
 @dataclass(frozen=True)
 class DepthImage:
     """The depth that a sensor measured for a photo: an image of distances along the optical axis.
-
     path: PNG or TIFF of one channel, or NumPy .npy, [h, w]; 0 = nothing measured. scale: scene units per stored unit.
-    lens: camera that took it, at the photo's pose; None when it shows what the photo shows, at any resolution.
-    """
+    lens: camera that took it, at the photo's pose; None when it shows what the photo shows, at any resolution."""
 
     path: Path
     scale: float

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
@@ -13,8 +12,9 @@ import numpy as np
 from perception.bags.poses import Poses
 from perception.bags.read import CAMERA_INFO, DEPTH_TRANSPORT, IMAGES, Bag, camera_of, raw_rows, stamp_of
 from perception.errors import InputError
-from perception.photos.camera_file import read_camera, write_camera_info
+from perception.photos.camera_file import camera_info, lens_of
 from perception.photos.decode import read_picture
+from perception.photos.depth import measured
 from perception.photos.lens import camera_from_lens, rescale_lens
 from perception.types import Lens
 
@@ -24,7 +24,8 @@ MILLIMETRES, LARGEST = 1000.0, 65534
 """Stored units per metre, and the largest: 65535 means saturated to many programs."""
 _SAME_LENS = 0.01
 """Largest relative difference between focal lengths for which depth in the photos' frame counts as registered."""
-_HEADER = 12
+_HEADER = struct.Struct("<iff")
+"""Begins a message of compressedDepth: the format, a and b, of which 32FC1 stores v = a / depth + b as PNG."""
 _NAMED = ("aligned", "registered")
 _TYPES = {"16UC1": "u2", "32FC1": "f4"}
 
@@ -59,34 +60,21 @@ def decode_depth(message: Any, where: str) -> np.ndarray:
     """Depth [h, w] float32 in metres, 0 = nothing measured. 16UC1 holds millimetres, 32FC1 metres (ROS REP 118)."""
     kind = str(getattr(message, "encoding", None) or message.format)
     what = f"depth image of format '{kind}'; expected png of one channel"
+    data = bytes(message.data)
     if hasattr(message, "encoding"):
-        image = _raw(message, kind, where)
-    elif DEPTH_TRANSPORT in kind:
-        image = _compressed(bytes(message.data), kind, where, what)
+        if kind not in _TYPES:
+            raise InputError(f"{where}: depth is encoded as '{kind}'; expected 16UC1 (mm) or 32FC1 (m)")
+        dtype = np.dtype(_TYPES[kind]).newbyteorder(">" if message.is_bigendian else "<")
+        image = raw_rows(message, dtype.itemsize, where).view(dtype)
     else:
-        image = read_picture(bytes(message.data), where, what)
+        image = read_picture(data[_HEADER.size :] if DEPTH_TRANSPORT in kind else data, where, what)
+    if DEPTH_TRANSPORT in kind and kind.startswith("32FC1"):
+        _, a, b = _HEADER.unpack_from(data)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            image = np.where(image > 0, a / (image.astype(np.float32) - b), 0).astype(np.float32)
     if image.ndim != 2:
         raise InputError(f"{where}: not a readable {what}")
-    metres = image.astype(np.float32) / (np.float32(1) if image.dtype.kind == "f" else np.float32(MILLIMETRES))
-    metres[~np.isfinite(metres) | (metres < 0) | ((image == 65535) & (image.dtype == np.uint16))] = 0
-    return metres
-
-
-def _raw(message: Any, kind: str, where: str) -> np.ndarray:
-    if kind not in _TYPES:
-        raise InputError(f"{where}: depth is encoded as '{kind}'; expected 16UC1 (mm) or 32FC1 (m)")
-    dtype = np.dtype(_TYPES[kind]).newbyteorder(">" if message.is_bigendian else "<")
-    return np.asarray(raw_rows(message, dtype.itemsize, where).view(dtype))
-
-
-def _compressed(data: bytes, kind: str, where: str, what: str) -> np.ndarray:
-    """ROS's compressedDepth: a header (int32, float a, float b), then PNG; 32FC1 stores v = a / depth + b."""
-    image = read_picture(data[_HEADER:], where, what)
-    if not kind.startswith("32FC1"):
-        return image
-    _, a, b = struct.unpack("<iff", data[:_HEADER])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(image > 0, a / (image.astype(np.float32) - b), 0).astype(np.float32)
+    return measured(image) / np.float32(1 if image.dtype.kind == "f" else MILLIMETRES)
 
 
 def registered(depth: np.ndarray, own: Lens, color: Lens, color_from_depth: np.ndarray) -> np.ndarray:
@@ -112,24 +100,20 @@ def write_depth(
     bag: Bag, topic: str, stamps: dict[str, int], lens: Lens, frame: str, poses: Poses, folder: Path
 ) -> tuple[dict[str, str], str]:
     """Writes the depth image nearest in time to each photo, 16-bit PNG in millimetres: file by photo, and a text.
-
     stamps: times of the photos in ns. lens, frame: of the photos. Depth of another frame or lens is registered by its
-    camera_info and tf; InputError where these are missing.
-    """
+    camera_info and tf; InputError where these are missing."""
     own = _depth_lens(bag, topic)
     times = np.array([stamp_of(message) or recorded for _, recorded, message in bag.messages([topic])])
     nearest = {name: int(np.abs(times - stamp).argmin()) for name, stamp in stamps.items()}
     apart = {name: abs(int(times[index]) - stamps[name]) / 1e9 for name, index in nearest.items()}
-    wanted: dict[int, list[str]] = {}
-    for name, index in nearest.items():
-        if apart[name] <= APART:
-            wanted.setdefault(index, []).append(name)
-    if not wanted:
+    written = {name: f"{folder.name}/{Path(name).stem}.png" for name in stamps if apart[name] <= APART}
+    if not written:
         found = f"no image of {topic} lies within {APART} s of a photo (the nearest: {min(apart.values()):.3g} s)"
         raise InputError(f"{bag.path}: {found}; give another --depth, or --depth none")
     folder.mkdir()
     for index, (_, recorded, message) in enumerate(bag.messages([topic])):
-        if index not in wanted:
+        names = [name for name in written if nearest[name] == index]
+        if not names:
             continue
         depth, there = decode_depth(message, f"{bag.path}: {topic}"), _frame_of(message)
         if there != frame.lstrip("/") or (own is not None and not _same(own, lens)):
@@ -140,9 +124,8 @@ def write_depth(
             depth = registered(depth, own, lens, moved)
         stored = np.round(depth * MILLIMETRES)
         data = cv2.imencode(".png", np.where(stored <= LARGEST, stored, 0).astype(np.uint16))[1].tobytes()
-        for name in wanted[index]:
-            (folder / f"{Path(name).stem}.png").write_bytes(data)
-    written = {name: f"{folder.name}/{Path(name).stem}.png" for names in wanted.values() for name in names}
+        for name in names:
+            (folder.parent / written[name]).write_bytes(data)
     most = max(apart[name] for name in written)
     return written, f"{topic}, {len(written)} of {len(stamps)} photos, at most {1000 * most:.0f} ms apart"
 
@@ -155,13 +138,9 @@ def _depth_lens(bag: Bag, topic: str) -> Lens | None:
     name, rectified = camera_of(topic)
     if name not in bag.of_type(CAMERA_INFO):
         return None
-    message = next((message for _, _, message in bag.messages([name])), None)
-    if message is None:
-        return None
-    with TemporaryDirectory() as folder:
-        file = Path(folder) / "camera_info.yaml"
-        write_camera_info(file, message, rectified=rectified)
-        return read_camera(file)
+    for _, _, message in bag.messages([name]):
+        return lens_of(camera_info(message, rectified), f"{bag.path}: {name}")
+    return None
 
 
 def _same(a: Lens, b: Lens) -> bool:

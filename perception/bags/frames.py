@@ -18,7 +18,7 @@ from perception.errors import InputError
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
 from perception.io.atomic import atomic_directory
 from perception.map.outputs import check_empty
-from perception.photos.camera_file import read_camera, write_camera_info
+from perception.photos.camera_file import camera_info, read_camera, write_camera
 from perception.photos.lens import FISHEYE, PERSPECTIVE
 from perception.photos.video import Chooser
 from perception.types import Lens
@@ -69,20 +69,23 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
         with atomic_directory(output, fresh=True) as aside:
             lens = _write_camera(aside / "camera.yaml", options.camera, info, topic, size, source)
             stamps, frame = _write_images(bag, topic, chosen, aside / "images")
-            depth, told = dict[str, str](), None
+            depth, source_of_depth = dict[str, str](), None
             try:
                 measured = choose_depth(bag, depths, options.depth, frame)
                 if measured is not None:
-                    depth, told = write_depth(bag, measured, stamps, lens, frame, poses, aside / "depth")
-            except InputError as error:  # depth that was not asked for and cannot be used is left out
+                    depth, source_of_depth = write_depth(bag, measured, stamps, lens, frame, poses, aside / "depth")
+            except InputError as error:  # depth that no option names and that cannot be used is left out
                 if options.depth is not None:
                     raise
                 shutil.rmtree(aside / "depth", ignore_errors=True)
-                told = f"left out: {error}"
-            known, fixed = _place(poses, stamps, frame, options.fixed_frame)
-            down = None if fixed is None else gravity(bag, poses, fixed)
+                source_of_depth = f"left out: {error}"
+            known, fixed = _camera_poses(poses, stamps, frame, options.fixed_frame)
+            measured_down = None if fixed is None else gravity(bag, poses, fixed)
+            down, down_error = (None, None) if measured_down is None else (measured_down[0].tolist(), measured_down[1])
+            vertical = {"gravity": down, "gravity_std_deg": down_error}
             if fixed is not None:
-                _write_transforms(aside / "transforms.json", known, stamps, fixed, lens, depth, down)
+                data = {**_transforms(known, stamps, lens, depth), "world_frame": fixed, **(vertical if down else {})}
+                (aside / "transforms.json").write_text(json.dumps(data, indent=1), encoding="utf-8")
     facts = {
         "output": str(output),
         "topic": topic,
@@ -93,19 +96,17 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
         "camera_frame": frame,
         "size": list(size),
         "camera_model": lens.model,
-        "depth": told,
+        "depth": source_of_depth,
         "with_depth": len(depth),
-        "gravity": None if down is None else down[0].tolist(),
-        "gravity_std_deg": None if down is None else down[1],
+        **vertical,
     }
     return facts, _text(facts)
 
 
 def _camera_info(bag: Bag, topic: str, wanted: str | None) -> Any:
     """The first CameraInfo of the camera that publishes `topic`."""
-    topics = bag.of_type(CAMERA_INFO)
-    beside, _ = camera_of(topic)
-    name = wanted or (beside if beside in topics else topics[0] if len(topics) == 1 else beside)
+    topics, (beside, _) = bag.of_type(CAMERA_INFO), camera_of(topic)
+    name = wanted or (topics[0] if len(topics) == 1 else beside)
     if name not in topics:
         advice = "give its topic with --camera-info, or a camera file with --camera (perception calibrate makes one)"
         raise InputError(f"{bag.path}: has no camera_info '{name}' (found {', '.join(topics) or 'none'}); {advice}")
@@ -119,7 +120,7 @@ def _write_camera(path: Path, camera: Path | None, info: Any, topic: str, size: 
         path.write_bytes(Path(camera).read_bytes() if Path(camera).is_file() else b"")
         lens = read_camera(camera)
     else:
-        write_camera_info(path, info, rectified=camera_of(topic)[1])
+        write_camera(path, camera_info(info, rectified=camera_of(topic)[1]))
         lens = read_camera(path)
     if (lens.width, lens.height) != size:
         found = f"images of {topic} are {size[0]}x{size[1]} pixels, the camera {lens.width}x{lens.height}"
@@ -142,7 +143,7 @@ def _write_images(bag: Bag, topic: str, chosen: list[int], folder: Path) -> tupl
     return stamps, frame
 
 
-def _place(
+def _camera_poses(
     poses: Poses, stamps: dict[str, int], frame: str, fixed: str | None
 ) -> tuple[dict[str, np.ndarray], str | None]:
     """camera_from_world by image, in order, and the world frame, None without poses: the first of FIXED_FRAMES (or the
@@ -158,17 +159,10 @@ def _place(
     return best, world
 
 
-def _write_transforms(
-    path: Path,
-    known: dict[str, np.ndarray],
-    stamps: dict[str, int],
-    fixed: str,
-    lens: Lens,
-    depth: dict[str, str],
-    down: tuple[np.ndarray, float] | None,
-) -> None:
-    """nerfstudio's format: only frames with a pose, OpenGL camera axes, pixel centres at +0.5, depth in millimetres.
-    "gravity" points down in the world; "gravity_std_deg" is its standard error in degrees."""
+def _transforms(
+    known: dict[str, np.ndarray], stamps: dict[str, int], lens: Lens, depth: dict[str, str]
+) -> dict[str, Any]:
+    """nerfstudio's format: frames with a pose, OpenGL camera axes, pixel centres at +0.5, depth in millimetres."""
     frames = [
         {
             "file_path": f"images/{name}",
@@ -178,16 +172,11 @@ def _write_transforms(
         }
         for name, pose in known.items()
     ]
-    fx, fy, cx, cy, *extra = lens.params
-    data: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE" if lens.model == "OPENCV_FISHEYE" else "OPENCV"}
-    data |= {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": lens.width, "h": lens.height}
-    data |= dict(zip(FISHEYE if lens.model == "OPENCV_FISHEYE" else PERSPECTIVE, extra, strict=False))
-    if depth:
-        data["depth_unit_scale_factor"] = 1 / MILLIMETRES
-    if down is not None:
-        data |= {"gravity": down[0].tolist(), "gravity_std_deg": down[1]}
-    facts = {"metric": True, "world_frame": fixed}  # ROS measures in metres (REP 103)
-    path.write_text(json.dumps({**data, **facts, "frames": frames}, indent=1), encoding="utf-8")
+    model, names = ("OPENCV_FISHEYE", FISHEYE) if lens.model == "OPENCV_FISHEYE" else ("OPENCV", PERSPECTIVE)
+    keys = ("fl_x", "fl_y", "cx", "cy", *names)
+    data = {"camera_model": model, "w": lens.width, "h": lens.height, **dict(zip(keys, lens.params, strict=False))}
+    unit = {"depth_unit_scale_factor": 1 / MILLIMETRES} if depth else {}
+    return {**data, **unit, "metric": True, "frames": frames}  # ROS measures in metres (REP 103)
 
 
 def _text(facts: dict[str, Any]) -> str:

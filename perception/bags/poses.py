@@ -26,10 +26,10 @@ class Poses:
     """A tree of frames over time: parent_from_child samples of every child frame."""
 
     def __init__(self) -> None:
-        self._samples: dict[str, list[tuple[int, np.ndarray]]] = {}
-        self._static: set[str] = set()
-        self.parents: dict[str, str] = {}
-        self._arrays: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        self.parents = dict[str, str]()
+        self._samples = dict[str, list[tuple[int, np.ndarray]]]()
+        self._static = set[str]()
+        self._arrays = dict[str, tuple[np.ndarray, np.ndarray]]()
 
     def add(self, parent: str, child: str, time: int, parent_from_child: np.ndarray, static: bool = False) -> None:
         """Adds one sample [4, 4] at a time in ns. A frame keeps its first parent."""
@@ -123,7 +123,6 @@ def gravity(bag: Bag, poses: Poses, fixed: str) -> tuple[np.ndarray, float] | No
     if len(ups) < LEAST_SAMPLES:
         return None
     means = np.array([np.mean(block, axis=0) for block in np.array_split(np.array(ups), BLOCKS)])
-    down = -means.mean(axis=0) / np.linalg.norm(means.mean(axis=0))
-    spread = np.degrees(np.linalg.norm(means - means.mean(axis=0), axis=1))
-    error = float(np.sqrt((spread**2).sum() / (BLOCKS * (BLOCKS - 1)) + BIAS_DEG**2))
-    return down, error
+    up = means.mean(axis=0)
+    spread = np.degrees(np.linalg.norm(means - up, axis=1))
+    return -up / np.linalg.norm(up), float(np.sqrt((spread**2).sum() / (BLOCKS * (BLOCKS - 1)) + BIAS_DEG**2))

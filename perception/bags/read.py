@@ -116,13 +116,9 @@ _EIGHT_BIT: dict[str, tuple[int, int | None]] = {
 
 def decode_image(message: Any, where: str) -> np.ndarray:
     """An Image or CompressedImage as [H, W, 3] uint8 BGR. InputError naming `where` if it is not an 8-bit image."""
-    if hasattr(message, "encoding"):
-        return _raw(message, where)
-    what = f"compressed image of format '{message.format}' (jpeg, png are)"
-    return read_picture(bytes(message.data), where, what, cv2.IMREAD_COLOR)
-
-
-def _raw(message: Any, where: str) -> np.ndarray:
+    if not hasattr(message, "encoding"):
+        what = f"compressed image of format '{message.format}' (jpeg, png are)"
+        return read_picture(bytes(message.data), where, what, cv2.IMREAD_COLOR)
     encoding = str(message.encoding)
     if encoding not in _EIGHT_BIT:
         known = f"{', '.join(_EIGHT_BIT)} (a depth image? give another --topic)"
@@ -151,6 +147,4 @@ def encoded(message: Any, picture: np.ndarray) -> tuple[str, bytes]:
             return ".jpg", data
         if data[:4] == b"\x89PNG":
             return ".png", data
-    done, buffer = cv2.imencode(".png", picture)
-    assert done  # encoding an 8-bit image as PNG does not fail
-    return ".png", buffer.tobytes()
+    return ".png", cv2.imencode(".png", picture)[1].tobytes()

@@ -56,28 +56,25 @@ def refine(
         if blur not in smooth:
             smooth[blur] = cv2.GaussianBlur(texture.astype(np.float32), (0, 0), blur)
         template = _sample(smooth[blur], (corner + patch) / square * per_square + margin - 0.5)
-        moved = _fit(image, slopes, at, template)
-        if moved is not None:
-            refined[i] = _apply(laid, corner[None])[0] + moved
-            if np.linalg.norm(refined[i] - pixels[i]) > _MOST:
-                refined[i] = pixels[i]
+        shift = _fit(image, slopes, at, template)
+        moved = None if shift is None else _apply(laid, corner[None])[0] + shift
+        if moved is not None and np.linalg.norm(moved - pixels[i]) <= _MOST:
+            refined[i] = moved
     return refined
 
 
 def _fit(image: np.ndarray, slopes: list[np.ndarray], at: np.ndarray, template: np.ndarray) -> np.ndarray | None:
     """The shift [2] that aligns the image at positions `at` [S, 2] with the template; None if it diverges."""
-    inside = (at.min(axis=0) > 2).all() and (at.max(axis=0) < np.array(image.shape[::-1]) - 3).all()
-    if not inside:
+    if not ((at > 2) & (at < np.array(image.shape[::-1]) - 3)).all():
         return None
     shift = np.zeros(2)
     for _ in range(_ITERATIONS):
         here = at + shift
-        seen = _sample(image, here)
+        # image(at + shift) = gain · template + offset − slopes · step
         columns = np.column_stack([template, np.ones(len(template)), *(-_sample(s, here) for s in slopes)])
-        solution = np.linalg.lstsq(columns, seen, rcond=None)[0]
-        step = solution[2:]
+        gain, _, *step = np.linalg.lstsq(columns, _sample(image, here), rcond=None)[0]
         shift += step
-        if solution[0] <= 0 or np.abs(shift).max() > _MOST:
+        if gain <= 0 or np.abs(shift).max() > _MOST:
             return None
         if np.abs(step).max() < 1e-3:
             break
@@ -137,7 +134,7 @@ class Board:
         """The board of "KIND:COLSxROWS:SQUARE[:MARKER[:DICTIONARY]]"; the marker is 3/4 of the square by default."""
         kind, squares, square, marker, dictionary = (*text.split(":"), *[""] * 5)[:5]
         try:
-            columns, rows = (int(word) for word in squares.lower().split("x"))
+            columns, rows = (int(side) for side in squares.lower().split("x"))
             side = float(square)
             return cls(kind, (columns, rows), side, float(marker or 0.75 * side), dictionary or "5X5_100")
         except ValueError as error:
@@ -163,10 +160,10 @@ class Board:
     def _detectors(self) -> list[tuple[Any, np.ndarray, np.ndarray]]:
         """(detector, corners, texture) of the current ChArUco pattern, and of the legacy pattern (OpenCV before 4.6),
         which differs for an even number of rows."""
-        words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
         size, found = tuple(squares * PER_SQUARE + 2 * MARGIN for squares in self.squares), []
         for legacy in (False, True):
-            board = cv2.aruco.CharucoBoard(self.squares, self.square, self.marker, words)
+            board = cv2.aruco.CharucoBoard(self.squares, self.square, self.marker, dictionary)
             board.setLegacyPattern(legacy)
             texture = np.asarray(board.generateImage(size, None, MARGIN))
             found.append((cv2.aruco.CharucoDetector(board), np.asarray(board.getChessboardCorners()), texture))
@@ -176,8 +173,7 @@ class Board:
         for detector, corners, texture in self._detectors:
             pixels, ids, _, _ = detector.detectBoard(picture)
             if ids is not None and len(ids) >= MIN_CORNERS:
-                points = corners[np.ravel(ids)]
-                pixels = np.reshape(pixels, (-1, 2))
+                points, pixels = corners[np.ravel(ids)], np.reshape(pixels, (-1, 2))
                 return points, refine(picture, points, pixels, self.square, texture, PER_SQUARE, MARGIN)
         return None
 
@@ -185,7 +181,5 @@ class Board:
         columns, rows = self.squares[0] - 1, self.squares[1] - 1
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
         seen, pixels = cv2.findChessboardCornersSB(picture, (columns, rows), flags=flags)
-        if not seen:
-            return None
-        grid = np.stack([*np.meshgrid(np.arange(columns), np.arange(rows)), np.zeros((rows, columns))], axis=-1)
-        return grid.reshape(-1, 3) * self.square, np.reshape(pixels, (-1, 2))
+        corners = [(column, row, 0) for row in range(rows) for column in range(columns)]
+        return (np.array(corners) * self.square, np.reshape(pixels, (-1, 2))) if seen else None

@@ -17,7 +17,7 @@ from perception.calibration.solve import NAMES, Solution, solve
 from perception.errors import InputError
 from perception.io.atomic import atomic_file
 from perception.map.outputs import check_side_file, refuse_inputs
-from perception.photos.camera_file import write_camera
+from perception.photos.camera_file import camera_data, write_camera
 from perception.photos.decode import SUFFIXES, read_grey
 from perception.photos.video import frames
 
@@ -40,20 +40,30 @@ def run_calibration(source: Path, output: Path, board: Board, model: str = "auto
     """Calibrates a camera from a folder of photos or a video of a board: (JSON-serialisable result, table).
 
     Writes `output` (ROS camera_info YAML) and a .json with all figures beside it, of the same stem where `output` is a
-    .yaml or .yml. Photos are rotated according to
-    EXIF, as in mapping. Raises InputError if no board is found, or if the views are too few or too similar.
+    .yaml or .yml. Photos are rotated by their EXIF data. InputError if no board is seen, or if the views are too few or
+    too similar.
     """
     report = output.with_suffix(".json") if output.suffix.lower() in (".yaml", ".yml") else Path(f"{output}.json")
     refuse_inputs([output, report], _photos(source) if source.is_dir() else [source])
     check_side_file(report, output, "distortion_model")
     found, size, looked_at = _detect(source, board)
     views = distinct_views(found, size[0])
-    check_count(views, len(found), looked_at, str(board), str(source))
+    if not found:
+        raise InputError(
+            f"{source}: no {board} was found in {looked_at} pictures; check --board, --squares (of squares, not "
+            "corners) and --dictionary, and that the board is sharp and wholly lit"
+        )
+    if len(views) < MIN_VIEWS:
+        raise InputError(
+            f"{source}: the board is seen in {len(found)} of {looked_at} pictures, {len(views)} of them different; at "
+            f"least {MIN_VIEWS} different views are needed: move and tilt it (20 are good)"
+        )
     views = [views[i] for i in np.linspace(0, len(views) - 1, min(len(views), MAX_VIEWS)).round().astype(int)]
     solution = best_model(views, size, model)
-    notes = check_solution(solution, str(source))
-    result = _facts(solution, looked_at, len(found), board, notes)
-    write_camera(output, output.stem, solution.model, solution.size, solution.values)
+    result = _facts(solution, looked_at, len(found), board, check_solution(solution, source))
+    fx, fy, cx, cy, *distortion = solution.values.tolist()
+    K, kind = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], result["distortion_model"]
+    write_camera(output, camera_data(output.stem, solution.size, kind, K, distortion))
     with atomic_file(report) as aside:
         aside.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     result["camera"] = str(output)
@@ -70,9 +80,7 @@ def best_model(views: list[Detection], size: tuple[int, int], model: str = "auto
             solved.append(solve(name, views, size))
     if not solved:
         raise InputError("neither a pinhole nor a fisheye camera explains the boards found; is the board flat?")
-    if len(solved) == 2 and solved[1].rms > 0.95 * solved[0].rms:
-        return solved[0]
-    return solved[-1]
+    return solved[0] if len(solved) == 2 and solved[1].rms > 0.95 * solved[0].rms else solved[-1]
 
 
 def _photos(folder: Path) -> list[Path]:
@@ -135,21 +143,20 @@ def _facts(solution: Solution, looked_at: int, found: int, board: Board, notes: 
 
 
 def _table(result: dict[str, Any]) -> str:
-    lines = [f"{result['model']} ({result['distortion_model']}), {result['size'][0]}x{result['size'][1]} pixels"]
-    lines.append(f"{'':6}{'value':>14}{'+- sigma':>12}")
-    for name, row in result["parameters"].items():
-        lines.append(f"{name:6}{row['value']:>14.5f}{row['sigma']:>12.5f}")
+    rows = (f"{name:6}{row['value']:>14.5f}{row['sigma']:>12.5f}" for name, row in result["parameters"].items())
     worst = max(result["views"], key=result["views"].get)
-    lines.append(
+    return "\n".join([
+        f"{result['model']} ({result['distortion_model']}), {result['size'][0]}x{result['size'][1]} pixels",
+        f"{'':6}{'value':>14}{'+- sigma':>12}",
+        *rows,
         f"reprojection error {result['reprojection_error_px']:.3f} px over {len(result['views'])} views "
         f"(worst {worst}: {result['views'][worst]:.3f} px); {result['pictures_with_board']} of "
-        f"{result['pictures_looked_at']} pictures show the board"
-    )
-    cover, tilts = f"{result['coverage']:.0%}", f"{result['tilt_spread_degrees']:.0f}"
-    lines.append(f"corners cover {cover} of the picture, tilts differ by {tilts} deg")
-    lines += [f"warning: {note}" for note in result["warnings"]]
-    lines.append(f"written to {result['camera']}")
-    return "\n".join(lines)
+        f"{result['pictures_looked_at']} pictures show the board",
+        f"corners cover {result['coverage']:.0%} of the picture, "
+        f"tilts differ by {result['tilt_spread_degrees']:.0f} deg",
+        *(f"warning: {note}" for note in result["warnings"]),
+        f"written to {result['camera']}",
+    ])  # fmt: skip
 
 
 def distinct_views(views: Sequence[Detection], width: int) -> list[Detection]:
@@ -179,21 +186,7 @@ def tilt_spread(solution: Solution) -> float:
     return float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1, 1))))
 
 
-def check_count(views: Sequence[Detection], found: int, looked_at: int, what: str, source: str) -> None:
-    """Raises InputError if no board was found, or too few distinct views of it."""
-    if found == 0:
-        raise InputError(
-            f"{source}: no {what} was found in {looked_at} pictures; check --board, --squares (of squares, not "
-            "corners) and --dictionary, and that the board is sharp and wholly lit"
-        )
-    if len(views) < MIN_VIEWS:
-        raise InputError(
-            f"{source}: the board is seen in {found} of {looked_at} pictures, {len(views)} of them different; at least "
-            f"{MIN_VIEWS} different views are needed: move and tilt it (20 are good)"
-        )
-
-
-def check_solution(solution: Solution, source: str) -> list[str]:
+def check_solution(solution: Solution, source: Path) -> list[str]:
     """Returns warnings. Raises InputError if the views do not determine the camera."""
     spread = tilt_spread(solution)
     if spread < MIN_TILT_SPREAD:

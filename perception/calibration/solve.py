@@ -66,10 +66,8 @@ def project(model: str, values: np.ndarray, pose: np.ndarray, points: np.ndarray
 
 def solve(model: str, views: Sequence[Detection], size: tuple[int, int]) -> Solution:
     """Calibrates from at least two views of a board. size: (width, height) of the images.
-
     k3 of the pinhole model is kept only if it differs from 0 by more than three standard deviations. Outlier corners
-    are removed, and the rest is solved again. InputError when the model does not fit.
-    """
+    are removed, and the rest is solved again. InputError when the model does not fit."""
     free = np.arange(len(NAMES[model])) < 8  # k3 is the last of the pinhole's
     try:
         solution = _solved(model, views, size, free)

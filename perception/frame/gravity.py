@@ -114,15 +114,13 @@ def _solved(
 
 def _standard_error_of_roll(rolls: np.ndarray) -> float:
     """Of each of N rolls, such that their mean has the right error: neighbours in time are alike.
-
     Their spread times √(N / (n − 2)), n = N (1 − r) / (1 + r) independent rolls, from which two numbers are estimated;
-    r: correlation of neighbours (first-order autoregression).
-    """
+    r: correlation of neighbours (first-order autoregression)."""
     off = rolls - np.median(rolls)
-    alike = np.clip(float(off[1:] @ off[:-1]) / max(float(off @ off), 1e-12), 0, 0.95)
+    r = np.clip(float(off[1:] @ off[:-1]) / max(float(off @ off), 1e-12), 0, 0.95)
     spread = np.clip(1.4826 * np.median(np.abs(off)), np.radians(0.5), np.radians(10))
-    count = max(len(rolls) * (1 - alike) / (1 + alike), 2.5)
-    return float(spread * np.sqrt(len(rolls) / (count - 2)))
+    n = max(len(rolls) * (1 - r) / (1 + r), 2.5)
+    return float(spread * np.sqrt(len(rolls) / (n - 2)))
 
 
 Plane = tuple[np.ndarray, float]
@@ -157,18 +155,19 @@ def _planes(points: np.ndarray, down: np.ndarray, near: float, seed: int) -> tup
             if mine.sum() < max(least, 30):
                 break
             middle = rest[mine].mean(axis=0)
-            axes = np.linalg.svd(rest[mine] - middle, full_matrices=False)[1:]
-            mine = np.abs((rest - middle) @ axes[1][2]) < THICKNESS * extent
+            singular, axes = np.linalg.svd(rest[mine] - middle, full_matrices=False)[1:]
+            mine = np.abs((rest - middle) @ axes[2]) < THICKNESS * extent
         if mine.sum() < max(least, 30):
             break
-        around = np.abs((rest - middle) @ axes[1][2]) < 2 * THICKNESS * extent
-        normal, spread = axes[1][2], axes[0] / np.sqrt(len(rest))
-        # slope of a line fitted to N points of deviation s over a spread e: s / (e √N); errors of neighbours correlate
-        error = float(2 * spread[2] / max(spread[1], 1e-12) / np.sqrt(mine.sum()))
-        error += CLUTTER * (around.sum() / mine.sum() - 1) * THICKNESS * extent / max(spread[1], 1e-12)
-        cosine = abs(float(normal @ down))
+        around = np.abs((rest - middle) @ axes[2]) < 2 * THICKNESS * extent
+        _, width, deviation = singular / np.sqrt(len(rest))
+        width = max(width, 1e-12)
+        # slope of a line fitted to N points of deviation s over a width e: s / (e √N); errors of neighbours correlate
+        error = float(2 * deviation / width / np.sqrt(mine.sum()))
+        error += CLUTTER * (around.sum() / mine.sum() - 1) * THICKNESS * extent / width
+        cosine = abs(float(axes[2] @ down))
         if cosine > np.cos(near) or cosine < np.sin(near):
-            found[0 if cosine > 0.5 else 1].append((normal, error))
+            found[0 if cosine > 0.5 else 1].append((axes[2], error))
         rest = rest[~mine]
     return found
 

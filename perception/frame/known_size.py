@@ -14,7 +14,7 @@ import numpy as np
 
 from perception.calibration.board import Board, refine
 from perception.errors import InputError
-from perception.frame.scale import LARGEST_ERROR, KnownLength, Measurement
+from perception.frame.scale import LARGEST_ERROR, KnownLength, Measurement, jackknife_error
 from perception.geometry import align_similarity
 from perception.photos.decode import read_grey
 from perception.photos.lens import camera_from_lens
@@ -46,19 +46,19 @@ def scale_of_tags(views: Sequence[View], size: float) -> Measurement:
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     for family in TAG_FAMILIES:
-        words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{family}"))
-        detector = cv2.aruco.ArucoDetector(words, parameters)
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{family}"))
+        detector = cv2.aruco.ArucoDetector(dictionary, parameters)
         seen: dict[int, Sighting] = {}
         for number, view in enumerate(views):
             picture = read_grey(view.photo)
             corners, ids, _ = detector.detectMarkers(picture)
-            numbers = [] if ids is None else [int(tag) for tag in np.ravel(ids)]
-            for tag, pixels in zip(numbers, corners, strict=True):
+            for tag, pixels in zip(map(int, () if ids is None else np.ravel(ids)), corners, strict=True):
                 sighting = seen.setdefault(tag, Sighting(square, np.full((len(views), 4, 2), np.nan)))
                 # OpenCV's corners lie 0.2 to 0.6 pixels inside: they are aligned with the printed pattern.
-                pattern = np.pad(cv2.aruco.generateImageMarker(words, tag, SIDE), MARGIN, constant_values=255)
-                pixels = np.reshape(pixels, (-1, 2))
-                pixels = refine(picture, square, pixels, PATCH * size, pattern, PATCH * SIDE, MARGIN)
+                pattern = np.pad(cv2.aruco.generateImageMarker(dictionary, tag, SIDE), MARGIN, constant_values=255)
+                pixels = refine(
+                    picture, square, np.reshape(pixels, (-1, 2)), PATCH * size, pattern, PATCH * SIDE, MARGIN
+                )
                 sighting.rays[number] = rays_of_pixels(view, pixels + 0.5)
         shown = [s for s in seen.values() if np.isfinite(s.rays[:, 0, 0]).sum() >= 2]
         if shown:
@@ -69,32 +69,31 @@ def scale_of_tags(views: Sequence[View], size: float) -> Measurement:
 
 def scale_of_board(views: Sequence[View], board: Board) -> Measurement:
     """Metres per unit from a calibration board; InputError when it is not seen in two photos."""
-    found = [board.detect(view.name, read_grey(view.photo)) for view in views]
-    points = np.unique(np.concatenate([d.board_points for d in found if d] or [np.empty((0, 3))]), axis=0)
+    detected = ((number, board.detect(view.name, read_grey(view.photo))) for number, view in enumerate(views))
+    found = {number: detection for number, detection in detected if detection is not None}
+    if len(found) < 2:
+        raise InputError(f"board: the {board} is seen in {len(found)} of {len(views)} photos, at least 2 are needed")
+    points = np.unique(np.concatenate([detection.board_points for detection in found.values()]), axis=0)
     rays = np.full((len(views), len(points), 2), np.nan)
-    for number, (view, detection) in enumerate(zip(views, found, strict=True)):
-        if detection is not None:
-            rows = [int(np.abs(points - corner).sum(axis=1).argmin()) for corner in detection.board_points]
-            rays[number, rows] = rays_of_pixels(view, detection.pixels + 0.5)
-    seen = sum(d is not None for d in found)
-    if seen < 2:
-        raise InputError(f"board: the {board} is seen in {seen} of {len(views)} photos, at least 2 are needed")
+    for number, detection in found.items():
+        rows = [int(np.abs(points - corner).sum(axis=1).argmin()) for corner in detection.board_points]
+        rays[number, rows] = rays_of_pixels(views[number], detection.pixels + 0.5)
     sighting = Sighting(points.astype(np.float64), rays)
-    return scale_of_sightings(views, [sighting], CORNER_ERROR, f"board in {seen} photos")
+    return scale_of_sightings(views, [sighting], CORNER_ERROR, f"board in {len(found)} photos")
 
 
 def scale_of_pixels(views: Sequence[View], length: KnownLength) -> Measurement:
     """Metres per unit from a length between two pixels, which must be given in at least two photos."""
     number, rays = {view.name: n for n, view in enumerate(views)}, np.full((len(views), 2, 2), np.nan)
-    assert length.pixels is not None
-    for name, pixels in length.pixels.items():
+    pixels_of = length.pixels or {}
+    for name, pixels in pixels_of.items():
         if name not in number:
             raise InputError(f"known length: '{name}' is none of the {len(views)} photos, such as {views[0].name}")
         rays[number[name]] = rays_of_pixels(views[number[name]], pixels)
-    if len(length.pixels) < 2:
+    if len(pixels_of) < 2:
         raise InputError("known length: both ends are needed in two photos or more, found one; add '; PHOTO X,Y X,Y'")
     ends = np.array([[0.0, 0, 0], [length.metres, 0, 0]])
-    text = f"known length {length.metres:g} m in {len(length.pixels)} photos"
+    text = f"known length {length.metres:g} m in {len(pixels_of)} photos"
     return scale_of_sightings(views, [Sighting(ends, rays)], CLICK_ERROR, text)
 
 
@@ -102,19 +101,15 @@ def scale_of_sightings(
     views: Sequence[View], sightings: Sequence[Sighting], pixel_error: float, source: str
 ) -> Measurement:
     """Metres per unit from things of known size; pixel_error: least standard deviation of their pixels.
-
-    The standard error is the larger of two estimates. The first adds random noise to the pixels. The second is a
-    jackknife estimate: the scale is computed once for each view that is left out, and their spread gives the error. It
-    covers wrong poses, which move all corners of a view together.
-    InputError when the corners do not have the shape.
-    """
+    The standard error is the larger of two estimates: by random noise of the pixels, and by the jackknife over views,
+    which covers wrong poses, as these move all corners of a view together. InputError for corners of another shape."""
     poses = np.stack([view.camera_from_world for view in views])
     focal = float(np.median([np.sqrt(view.K[0, 0] * view.K[1, 1]) for view in views]))
     rng, usable = np.random.default_rng(0), []
     for thing in sightings:
         rays, residuals = _without_outliers(poses, thing.rays, pixel_error / focal)
         seen = np.isfinite(residuals)
-        freedom = max(int(seen.sum()) - 3 * len(thing.corners) - 2, 1)  # 2 less: few residuals tell the noise badly
+        freedom = max(int(seen.sum()) - 3 * len(thing.corners) - 2, 1)  # 2 less: few residuals underestimate the noise
         noise = max(pixel_error / focal, float(np.sqrt((residuals[seen] ** 2).sum() / freedom)))
         drawn = [_fitted(poses, thing.corners, rays + noise * rng.standard_normal(rays.shape)) for _ in range(DRAWS)]
         metres, off = _fitted(poses, thing.corners, rays)
@@ -131,14 +126,13 @@ def scale_of_sightings(
         known = np.isfinite(values)
         return float(weights[known] @ values[known] / weights[known].sum()) if known.any() else np.nan
 
-    everyone = np.ones(len(views), bool)
+    number = np.arange(len(views))
     showing = np.flatnonzero(np.any([np.isfinite(r).any(axis=(1, 2)) for _, r, _ in usable], axis=0))
-    metres, error = mean(everyone), float(weights.sum() ** -0.5)
-    each = np.array([mean(everyone & (np.arange(len(views)) != v)) for v in showing])
+    error, each = float(weights.sum() ** -0.5), np.array([mean(number != left_out) for left_out in showing])
     each = each[np.isfinite(each)]
     if len(each) >= 3:
-        error = max(error, float(np.sqrt((len(each) - 1) / len(each) * ((each - each.mean()) ** 2).sum())))
-    return Measurement(metres, error, source)
+        error = max(error, jackknife_error(each))
+    return Measurement(mean(number >= 0), error, source)
 
 
 def rays_of_pixels(view: View, pixels: np.ndarray) -> np.ndarray:
@@ -149,10 +143,8 @@ def rays_of_pixels(view: View, pixels: np.ndarray) -> np.ndarray:
 
 def triangulated(poses: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """Points [K, 3] seen on rays [V, K, 2] (NaN: not seen) from poses [V, 4, 4]; NaN for less than two views.
-
     (x r₃ − r₁) · X = t₁ − x t₃, and for y likewise, with r, t the rows of [R | t]; weighted by 1 / depth, so that the
-    residual is that of the image (Hartley and Zisserman, Multiple View Geometry, 12.2).
-    """
+    residual is that of the image (Hartley and Zisserman, Multiple View Geometry, 12.2)."""
     seen = np.isfinite(rays).all(axis=2)
     used = seen.any(axis=1)
     poses, rays, seen = poses[used], np.where(seen[..., None], rays, 0.0)[used], seen[used]

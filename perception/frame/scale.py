@@ -13,15 +13,14 @@ import numpy as np
 from perception.errors import InputError
 from perception.geometry import align_similarity, camera_centres
 from perception.io.documents import DAMAGE
-from perception.photos.decode import exif_folder, open_photo
+from perception.photos.decode import GPS_FOLDER, exif_of, open_photo
 from perception.photos.depth import load_depth
 from perception.photos.lens import load_pycolmap
 from perception.types import View
 
 LARGEST_ERROR = 0.2
 """Relative standard error above which a measurement is not used."""
-SHARE_OF_VIEW = 200  # points per view whose depth is compared
-LEAST_POINTS = 20  # of a view whose depths are compared
+LEAST_POINTS, MOST_POINTS = 20, 200  # of a view, whose depth is compared
 SENSOR = 0.005
 """Relative standard error that all depths of a sensor have in common, by its calibration."""
 
@@ -39,6 +38,12 @@ class Measurement:
 
     def __str__(self) -> str:
         return f"{self.metres:.5g} ± {self.standard_error:.2g} m ({self.source})"
+
+
+def jackknife_error(each: np.ndarray) -> float:
+    """Standard error of an estimate, from its values `each` [n] without one of n observations:
+    √((n − 1) / n · Σ (each − mean)²) (Efron 1982, The Jackknife, equation 3.2)."""
+    return float(np.sqrt((len(each) - 1) / len(each) * ((each - each.mean()) ** 2).sum()))
 
 
 def combined(found: Sequence[Measurement]) -> tuple[Measurement | None, list[str]]:
@@ -92,7 +97,7 @@ def _depth_ratios(view: View, points: np.ndarray, rng: np.random.Generator) -> n
     with np.errstate(divide="ignore", invalid="ignore"):
         pixels = (local @ view.K.T)[:, :2] / local[:, 2:]
     inside = (local[:, 2] > 0) & (pixels >= 0).all(axis=1) & (pixels < [view.width, view.height]).all(axis=1)
-    rows = rng.permutation(np.flatnonzero(inside))[:SHARE_OF_VIEW]
+    rows = rng.permutation(np.flatnonzero(inside))[:MOST_POINTS]
     if len(rows) < LEAST_POINTS:
         return np.empty(0)
     x, y = pixels[rows].astype(np.int64).T
@@ -124,10 +129,10 @@ def known_length(text: str) -> KnownLength:
     try:
         if np.isnan(metres := float(length)):
             raise ValueError("its length is no number")
-        if places := _POINTS.fullmatch(rest):
-            found = KnownLength(metres, points=_finite([places[1], places[2]]))
+        if ends := _POINTS.fullmatch(rest):
+            found = KnownLength(metres, points=_finite([ends[1], ends[2]]))
         elif entries and all(len(e) == 3 and all(map(_PIXEL.fullmatch, e[1:])) for e in entries):
-            found = KnownLength(metres, pixels={photo.strip(): _finite(ends) for photo, *ends in entries})
+            found = KnownLength(metres, pixels={photo.strip(): _finite(pair) for photo, *pair in entries})
         elif len(names) == 2 and all(names) and ";" not in rest:
             found = KnownLength(metres, names=(names[0], names[1]))
         else:
@@ -139,22 +144,22 @@ def known_length(text: str) -> KnownLength:
     return found
 
 
-def _finite(places: list[str]) -> np.ndarray:
-    values = np.array([[float(x) for x in place.split(",")] for place in places])
+def _finite(ends: list[str]) -> np.ndarray:
+    values = np.array([[float(x) for x in end.split(",")] for end in ends])
     if not np.isfinite(values).all() or np.array_equal(values[0], values[1]):
-        raise ValueError("its ends must be two different places of finite numbers")
+        raise ValueError("its ends must be two different points of finite numbers")
     return values
 
 
 LEAST = 6  # photos with a position
-_GPS_FOLDER, _LATITUDE, _LONGITUDE, _ALTITUDE = 0x8825, 1, 3, 5  # EXIF tags; the values follow the references
+_LATITUDE, _LONGITUDE, _ALTITUDE = 1, 3, 5  # EXIF tags; the values follow the references
 
 
 def photo_position(photo: Path) -> np.ndarray | None:
     """Latitude and longitude in degrees and altitude in metres [3] from EXIF; None without them or out of range."""
     try:
         with open_photo(photo) as image:
-            tags = exif_folder(image, photo, _GPS_FOLDER)
+            tags = exif_of(image, photo, GPS_FOLDER)
         angles = []
         for tag, negative in ((_LATITUDE, "S"), (_LONGITUDE, "W")):
             degrees, minutes, seconds = (float(x) for x in tags[tag + 1])
@@ -186,11 +191,8 @@ def scale_of_gps(views: Sequence[View], seed: int = 0) -> tuple[Measurement | No
 
 def scale_of_positions(centres: np.ndarray, metres: np.ndarray, seed: int = 0) -> tuple[Measurement | None, list[str]]:
     """Metres per unit from camera centres [N, 3] and their measured positions [N, 3] with outliers, and notes.
-
-    The similarity metres = s R centres + t of least median residual over triples (LMedS) is refined on its inliers.
-    The standard error is a jackknife estimate: the scale is computed once for each photo that is left out, and their
-    spread gives the error. An error that all photos share is not part of it.
-    """
+    The similarity metres = s R centres + t of least median residual over triples (LMedS) is refined on its inliers. The
+    standard error is a jackknife estimate over photos. An error that all photos share is not part of it."""
     inside = _inliers(centres, metres, np.random.default_rng(seed))
     count = int(inside.sum())
     if count < LEAST:
@@ -198,7 +200,7 @@ def scale_of_positions(centres: np.ndarray, metres: np.ndarray, seed: int = 0) -
     a, b = metres[inside], centres[inside]
     scale = align_similarity(a, b)[0]
     each = np.array([align_similarity(np.delete(a, i, axis=0), np.delete(b, i, axis=0))[0] for i in range(count)])
-    error = float(np.sqrt((count - 1) / count * ((each - each.mean()) ** 2).sum()))
+    error = jackknife_error(each)
     if not (scale > 0 and error / scale <= LARGEST_ERROR):
         return None, [f"GPS is too coarse for the way the camera went ({count} photos) and is not used"]
     left = f", {len(centres) - count} outliers left out" if count < len(centres) else ""

@@ -21,32 +21,31 @@ from perception.types import Scene, View
 UNIT_IS_METRE, UNIT_OF_DEPTH = 0.03, 0.4
 """Largest deviation from 1, and largest standard error, at which a measured unit is taken as the metre as it is; the
 largest one, by depth images, from the metre that the input states at which those are used as they are."""
-SAMPLED = 200  # views whose depth images are read for the planes that tell gravity
+SAMPLED = 200  # views whose depth images are read for the planes that show gravity
 STATED = {"metres_per_unit": 1.0, "source": "the input, which states it", "standard_error": None}
 
 
 def in_world_frame(scene: Scene, options: FrameConfig, seed: int = 0) -> Scene:
-    """The scene in the map's frame; report["scale"], ["gravity"] and ["map_from_input"] tell how it was found.
+    """The scene in the map's frame, recorded in report["scale"], ["gravity"] and ["map_from_input"].
 
     A scene whose input has poses keeps its world unless `options.keep_world` is False: only the unit becomes the metre
     when `options` give a known size. Photos without poses get the map's frame as far as it is known: turned if the
-    standard error of gravity allows (`Gravity.confident`), in metres if something tells the scale. InputError for a
+    standard error of gravity allows (`Gravity.confident`), in metres if a scale is measured. InputError for a
     known size that is not seen.
     """
     posed = scene.report.get("input") != "photos"
-    asked = any((options.known_length, options.tag_size, options.board))
-    metric, scale, notes = _unit(scene, options, seed)
+    size_given = any((options.known_length, options.tag_size, options.board))
+    metric, scale, notes = _unit(scene, options, posed, seed)
     facts = {"scale": scale.to_json()} if scale is not None else {"scale": STATED} if metric else {}
     report = {**scene.report, **facts, "warnings": [*scene.report.get("warnings", []), *notes]}
-    scene = replace(scene, metric=metric, report=report)
-    scene = _depth_in_units(scene, scale, posed)
+    scene = _depth_in_units(replace(scene, metric=metric, report=report), scale, posed)
     gravity, notes = _gravity(scene, seed)
     scene.report["warnings"] += notes
     if gravity is not None:
         scene.report["gravity"] = gravity.to_json()
     keep = posed if options.keep_world is None else options.keep_world
     unit = 1.0 if metric or scale is None else scale.metres
-    if keep and not (posed and asked and options.keep_world is None):
+    if keep and not (posed and size_given and options.keep_world is None):
         return scene
     if gravity is None or not gravity.confident or keep:
         map_from_world = np.diag([unit, unit, unit, 1.0])
@@ -66,9 +65,8 @@ def measured_scale(
     views: Sequence[View], points: np.ndarray, options: FrameConfig, seed: int = 0
 ) -> tuple[Measurement | None, list[str]]:
     """Metres per unit from all sources that posed views offer, and notes. InputError as `in_world_frame`."""
-    found = [scale_of_depth(views, points, seed)]
     gps, notes = scale_of_gps(views, seed)
-    found.append(gps)
+    found = [scale_of_depth(views, points, seed), gps]
     if options.known_length is not None:
         length = known_length(options.known_length)
         if length.pixels is None:
@@ -83,7 +81,7 @@ def measured_scale(
     return scale, [*notes, *warnings]
 
 
-def _unit(scene: Scene, options: FrameConfig, seed: int) -> tuple[bool, Measurement | None, list[str]]:
+def _unit(scene: Scene, options: FrameConfig, posed: bool, seed: int) -> tuple[bool, Measurement | None, list[str]]:
     """Whether the unit is the metre, its measurement, notes."""
     scale, notes = measured_scale(scene.views, _real_points(scene), options, seed)
     if scale is None:
@@ -91,9 +89,8 @@ def _unit(scene: Scene, options: FrameConfig, seed: int) -> tuple[bool, Measurem
     off, error = abs(np.log(scale.metres)), scale.standard_error / scale.metres
     if scene.metric:
         if off > 3 * error + UNIT_IS_METRE:
-            notes.append(f"the input says its unit is the metre, but it is {scale}")
+            notes.append(f"the input states that its unit is the metre, but it is {scale}")
         return True, scale, notes
-    posed = scene.report.get("input") != "photos"
     return posed and bool(max(off, error) <= UNIT_IS_METRE), scale, notes
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.documents import safe_name
+from perception.io.documents import brief, safe_name
 from perception.photos.lens import load_pycolmap
 from perception.sfm.model import cloud_of, views_of_model
 from perception.sfm.options import ReadOptions
@@ -42,10 +42,8 @@ def is_workspace(folder: Path) -> bool:
 
 def read_workspace(folder: Path, options: ReadOptions) -> Scene:
     """The largest sparse model of a workspace as a Scene, in COLMAP's world.
-
     Photos that are missing or damaged are left out and reported. Image names that point outside the photo folder raise
-    InputError.
-    """
+    InputError."""
     found = {path: _read_model(path) for path in _models(folder)}
     path, model = max(found.items(), key=lambda item: item[1].num_reg_images())
     if model.num_reg_images() == 0:
@@ -87,7 +85,6 @@ def model_files(folder: Path) -> list[Path]:
 
 
 def _read_model(path: Path) -> Any:
-    pycolmap = load_pycolmap()
     suffix = ".bin" if (path / "images.bin").is_file() else ".txt"
     needed = [f"{stem}{suffix}" for stem in ("cameras", "images", "points3D")]
     absent = [name for name in needed if not (path / name).is_file()]
@@ -98,18 +95,15 @@ def _read_model(path: Path) -> Any:
     else:
         _refuse_nan_text(path)
     try:
-        return pycolmap.Reconstruction(path)
+        return load_pycolmap().Reconstruction(path)
     except (ValueError, RuntimeError, LookupError, TypeError) as error:
-        reason = str(error).splitlines()[0][:120] if str(error) else "unknown reason"
-        raise InputError(f"{path}: not a readable COLMAP model ({reason})") from error
+        raise InputError(f"{path}: not a readable COLMAP model ({brief(error)})") from error
 
 
 def _refuse_nan_text(path: Path) -> None:
     """InputError naming the file for NaN poses in a text model, on which COLMAP may abort the process."""
     file = path / "images.txt"
-    lines = [line for line in file.read_text(errors="replace").splitlines() if line and not line.startswith("#")]
-    for line in lines:
-        fields = line.split()
+    for fields in map(str.split, file.read_text(errors="replace").splitlines()):
         if len(fields) == 10 and any(value.lower().lstrip("+-") in ("nan", "inf") for value in fields[1:8]):
             raise InputError(f"{file}: the pose of {fields[9]} is not finite (NaN); repair or remove that photo")
 

@@ -36,21 +36,16 @@ _TEXTS = (
 _COLOR_FOLDERS = ("color", "image", "rgb")
 
 
-def is_recording(source: Path) -> bool:
-    """Whether folder `source` has one of the layouts."""
-    return _layout(source) is not None
-
-
 def open_recording(source: Path) -> Recording:
     """The recording in folder `source`. InputError for one that is damaged, or without a layout."""
-    read = _layout(source)
+    read = layout_of(source)
     if read is None:
         raise InputError(f"{source}: no RGB-D recording; expected the files of TUM, ScanNet, 7-Scenes or Redwood")
     return read(source)
 
 
-def _layout(source: Path) -> Callable[[Path], Recording] | None:
-    """What reads the layout that the folder has, recognised by its names; None where it has none."""
+def layout_of(source: Path) -> Callable[[Path], Recording] | None:
+    """The reader of the layout that the folder has, recognised by its names; None where it has none."""
     if (source / "rgb.txt").is_file() and (source / "depth.txt").is_file():
         return _tum
     if (source / "color").is_dir() and (source / "pose").is_dir():
@@ -74,12 +69,10 @@ def _color_folder(source: Path) -> Path | None:
 
 def refuse_depth_without_poses(source: Path) -> None:
     """InputError for a folder of photos that holds 16-bit depth images, which would be taken for photos."""
-    first = next(iter(sorted((source / "depth").glob("*.png"))), None)
-    if first is None:
-        return
-    with open_photo(first) as image:
-        is_depth = image.mode.startswith("I")
-    if is_depth:
+    for first in sorted((source / "depth").glob("*.png"))[:1]:
+        with open_photo(first) as image:
+            if not image.mode.startswith("I"):
+                return
         raise InputError(
             f"{source}: has depth images but no poses; expected transforms.json with depth_file_path, groundtruth.txt "
             "(TUM), pose/*.txt (ScanNet) or a trajectory *.log (Redwood); to map the photos alone, give their folder"
@@ -93,12 +86,11 @@ def _tum(source: Path) -> Recording:
         raise InputError(f"{truth}: missing, so depth has no poses; expected lines 'time tx ty tz qx qy qz qw'")
     (at, photos), (depth_at, depths) = (_listed(source / name) for name in ("rgb.txt", "depth.txt"))
     rows = _numbers(truth, 8)
-    rows = rows[np.argsort(rows[:, 0], kind="stable")]
-    if (np.linalg.norm(rows[:, 4:], axis=1) < 1e-6).any():
+    times, shifts, quaternions = np.split(rows[np.argsort(rows[:, 0], kind="stable"), :8], [1, 4], axis=1)
+    if (np.linalg.norm(quaternions, axis=1) < 1e-6).any():
         raise InputError(f"{truth}: a quaternion is zero; expected lines 'time tx ty tz qx qy qz qw'")
-    times, poses = rows[:, 0], np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:8]).as_matrix()
-    poses[:, :3, 3] = rows[:, 1:4]
+    times, poses = times[:, 0], np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = Rotation.from_quat(quaternions).as_matrix(), shifts
     nearest = np.abs(depth_at[None] - at[:, None]).argmin(axis=1)
     apart = np.abs(depth_at[nearest] - at)
     if apart.min() > TUM_APART:
@@ -133,11 +125,10 @@ def _scannet(source: Path) -> Recording:
     """Exported frames: color/, depth/ in mm, pose/ world_from_camera, infinite where tracking was lost."""
     photos = _images(source / "color")
     frames = _posed(source, photos, lambda photo, kind: source / kind / photo.stem)
-    intrinsics = source / "intrinsic"
     depth = next((frame.depth for frame in frames if frame.depth is not None), None)
-    own = None if depth is None else _matrix_lens(intrinsics / "intrinsic_depth.txt", photo_size(depth))
+    own = None if depth is None else _matrix_lens(source / "intrinsic/intrinsic_depth.txt", photo_size(depth))
     notes = _missing(len(photos) - len(frames), len(photos), "a pose (tracking was lost)")
-    lens = _matrix_lens(intrinsics / "intrinsic_color.txt", photo_size(photos[0]))
+    lens = _matrix_lens(source / "intrinsic/intrinsic_color.txt", photo_size(photos[0]))
     return Recording(source, "ScanNet", frames, lens, 1000.0, own, notes)
 
 
@@ -189,8 +180,7 @@ def _redwood(source: Path) -> Recording:
     poses = _trajectory(named[0], len(photos))
     frames = [Frame(f"{folder.name}/{photos[i].name}", photos[i], depths[i], pose) for i, pose in poses.items()]
     lens, notes = None, _missing(len(photos) - len(poses), len(photos), "a pose")
-    cameras = sorted(source.glob("*intrinsic*.json")) + sorted(source.glob("camera*.json"))
-    if cameras:
+    if cameras := sorted(source.glob("*intrinsic*.json")) + sorted(source.glob("camera*.json")):
         lens = _open3d_lens(cameras[0])
     elif photo_size(photos[0]) == _SIZE:
         lens = _lens(_PRIMESENSE, _SIZE)
@@ -238,8 +228,7 @@ def _rows(file: Path) -> list[list[str]]:
         lines = file.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{file}: cannot be read as text") from error
-    rows = [line.replace(",", " ").split() for line in lines if not line.lstrip().startswith("#")]
-    rows = [row for row in rows if row]
+    rows = [row for line in lines if (row := line.replace(",", " ").split()) and not row[0].startswith("#")]
     if not rows:
         raise InputError(f"{file}: is empty")
     return rows

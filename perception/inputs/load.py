@@ -17,10 +17,8 @@ from perception.types import Scene
 
 def load_scene(source: Path, options: ReadOptions) -> Scene:
     """Posed views of `source`, sorted by name, with a sparse cloud.
-
     A folder is read as a COLMAP workspace if it is one, else by its transforms.json if it has one, else as an RGB-D
-    recording if it has the layout of one, else as photos, with poses from structure from motion (see `readers`).
-    """
+    recording if it has the layout of one, else as photos, with poses from structure from motion (see `readers`)."""
     started = time.perf_counter()
     reader, camera, cloud, masks = reader_of(source), options.camera, options.init_points, options.masks
     if camera is not None and reader.cameras:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from pathlib import Path
 from perception.errors import InputError
 from perception.inputs import recordings
 from perception.inputs.colmap import is_workspace, model_files, read_workspace
-from perception.inputs.layouts import is_recording, open_recording, refuse_depth_without_poses, text_files
+from perception.inputs.layouts import layout_of, open_recording, refuse_depth_without_poses, text_files
 from perception.inputs.transforms import is_transforms, listed_files, listed_photos, read_transforms, transforms_file
 from perception.photos import video
 from perception.photos.decode import photo_size
@@ -35,10 +36,8 @@ class PhotoSizes:
 @dataclass(frozen=True)
 class Reader:
     """A kind of input. recognises: whether a path is one, from names alone. sizes: of its photos, from their headers.
-
     files: all that the scene may come from. read: the Scene. poses, cameras: whether the input brings poses, and the
-    intrinsics of its photos.
-    """
+    intrinsics of its photos."""
 
     recognises: Callable[[Path], bool]
     sizes: Callable[[Path], PhotoSizes]
@@ -50,15 +49,11 @@ class Reader:
 
 def _sizes(photos: Sequence[Path], depth: bool = False) -> PhotoSizes:
     """Sizes of the photos that can be read."""
-    sizes = [size for size in map(_size, photos) if size is not None]
+    sizes = []
+    for photo in photos:
+        with contextlib.suppress(InputError):
+            sizes.append(photo_size(photo))
     return PhotoSizes(sizes, f"{len(sizes)} photos", depth)
-
-
-def _size(photo: Path) -> tuple[int, int] | None:
-    try:
-        return photo_size(photo)
-    except InputError:
-        return None
 
 
 def _is_video(source: Path) -> bool:
@@ -87,17 +82,13 @@ def _read_video(source: Path, options: ReadOptions) -> Scene:
 def _recording_sizes(source: Path) -> PhotoSizes:
     frames = open_recording(source).frames
     taken = min(len(frames), recordings.MOST_FRAMES)
-    sizes = [_size(frames[0].photo) or SENSOR_SIZE] * taken if frames else []
-    return PhotoSizes(sizes, f"at most {taken} of {len(frames)} frames", bool(frames and frames[0].depth))
+    size = (_sizes([frame.photo for frame in frames[:1]]).sizes or [SENSOR_SIZE])[0]
+    return PhotoSizes([size] * taken, f"at most {taken} of {len(frames)} frames", bool(frames and frames[0].depth))
 
 
 def _recording_files(source: Path) -> list[Path]:
     images = [image for frame in open_recording(source).frames for image in (frame.photo, frame.depth)]
-    return [*text_files(source), *(image for image in images if image is not None)]
-
-
-def _read_recording(source: Path, options: ReadOptions) -> Scene:
-    return recordings.recorded_scene(open_recording(source), options)
+    return [*text_files(source), *filter(None, images)]
 
 
 def _read_photos(source: Path, options: ReadOptions) -> Scene:
@@ -123,7 +114,14 @@ READERS = (
         poses=True,
         cameras=True,
     ),
-    Reader(is_recording, _recording_sizes, _recording_files, _read_recording, poses=True, cameras=False),
+    Reader(
+        lambda source: layout_of(source) is not None,
+        _recording_sizes,
+        _recording_files,
+        lambda source, options: recordings.recorded_scene(open_recording(source), options),
+        poses=True,
+        cameras=False,
+    ),
     Reader(
         Path.is_dir, lambda source: _sizes(list_photos(source)), list_photos, _read_photos, poses=False, cameras=False
     ),
@@ -138,7 +136,7 @@ def reader_of(source: Path) -> Reader:
     """The first reader that recognises `source`. InputError where none does."""
     if not source.exists():
         raise InputError(f"{source}: no such file or folder; expected {EXPECTED}")
-    for reader in READERS:
-        if reader.recognises(source):
-            return reader
-    raise InputError(f"{source}: expected {EXPECTED}")
+    found = next((reader for reader in READERS if reader.recognises(source)), None)
+    if found is None:
+        raise InputError(f"{source}: expected {EXPECTED}")
+    return found

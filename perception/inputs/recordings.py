@@ -42,10 +42,8 @@ class Frame:
 @dataclass(frozen=True)
 class Recording:
     """kind: for messages. frames: in order of time. lens: of all photos, None when the folder has no intrinsics.
-
     metre: stored units of depth per metre. depth_lens: of the depth camera, at the photo's pose; None when depth shows
-    what the photo shows. notes, warnings: one line each.
-    """
+    what the photo shows. notes, warnings: one line each."""
 
     source: Path
     kind: str
@@ -82,20 +80,14 @@ def recorded_scene(recording: Recording, options: ReadOptions) -> Scene:
     return replace(posed_scene(views, options.cloud or NO_CLOUD, facts, options, least=1), metric=True)
 
 
-def choose_frames(
-    recording: Recording, lens: Lens, progress: Progress, strict: bool = False
-) -> tuple[list[Frame], list[str]]:
+def choose_frames(recording: Recording, lens: Lens, progress: Progress, strict: bool) -> tuple[list[Frame], list[str]]:
     """At most MOST_FRAMES frames: the sharpest of each stretch of motion (see `Chooser`); names of unreadable photos.
-
-    The motion between frames is what poses say: f / width (angle + distance / median depth), as a share of the width.
-    """
+    The motion between frames, as a share of the width, is that of their poses: f / width (angle + distance / depth)."""
     share, depth = lens.params[0] / lens.width, median_depth(recording)
-    chooser = Chooser()
-    shown: list[Frame] = []
-    damaged: list[str] = []
+    chooser, shown, damaged = Chooser(), list[Frame](), list[str]()
+    what = "photo; replace or remove it"
     for done, frame in enumerate(recording.frames, start=1):
         try:
-            what = "photo; replace or remove it"
             picture = read_picture(frame.photo, frame.photo, what, cv2.IMREAD_REDUCED_COLOR_2)
         except InputError:
             if strict:

@@ -28,7 +28,6 @@ _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV", "PERSPECTIVE")
 MILLIMETRE = 1e-3
 """Unit of depth images without `depth_unit_scale_factor` or `integer_depth_scale`, in metres: nerfstudio's default."""
-
 GRAVITY_ERROR = 1.0
 """Standard error in degrees of a `gravity` without `gravity_std_deg`, as of a phone's motion sensors."""
 
@@ -53,18 +52,12 @@ def read_transforms(file: Path, options: ReadOptions) -> Scene:
     listed = options.cloud
     if listed is None and data.get("ply_file_path"):
         listed = start_points(_listed(file, "ply_file_path", data["ply_file_path"]))
-    facts: dict[str, Any] = {
-        "input": "transforms",
-        "left_out": missing,
-        "warnings": notes,
-        "mean_reprojection_error_px": None,
-    }
+    facts: dict[str, Any] = {"input": "transforms", "left_out": missing, "warnings": notes, **_gravity(file, data)}
+    facts["mean_reprojection_error_px"] = None
     if options.cloud is None and listed is not None:
         facts["points_from"] = str(data["ply_file_path"])
-    facts |= _gravity(file, data)
     scene = posed_scene(views, listed or NO_CLOUD, facts, options, least=1)
-    scene.metric = data.get("metric") is True
-    return scene
+    return replace(scene, metric=data.get("metric") is True)
 
 
 def transforms_file(source: Path) -> Path:
@@ -102,8 +95,7 @@ def _views(
     file: Path, data: dict[str, Any], photos: dict[int, Path], masks: Path | None
 ) -> tuple[list[View], list[str]]:
     """Views sorted by name, and notes. photos: by number of the frame."""
-    views: dict[str, View] = {}
-    notes: set[str] = set()
+    views, notes = dict[str, View](), set[str]()
     root = os.path.commonpath([absolute(photo).parent for photo in photos.values()])
     for index, photo in photos.items():
         frame = data["frames"][index]
@@ -168,13 +160,12 @@ def _depth(file: Path, data: dict[str, Any], frame: dict[str, Any]) -> DepthImag
     listed = frame.get("depth_file_path", frame.get("depth_path"))
     if not listed:
         return None
-    path = _listed(file, "depth image", listed)
-    what = f"{file}: {frame['file_path']}"
-    scales = (_number({**data, **frame}, key, what) for key in ("depth_unit_scale_factor", "integer_depth_scale"))
+    what, keys = f"{file}: {frame['file_path']}", ("depth_unit_scale_factor", "integer_depth_scale")
+    scales = (_number({**data, **frame}, key, what) for key in keys)
     scale = next((scale for scale in scales if scale is not None), MILLIMETRE)
     if scale <= 0:
         raise InputError(f"{what}: the scale of its depth must be above 0, found {scale:g}")
-    return DepthImage(path, scale)
+    return DepthImage(_listed(file, "depth image", listed), scale)
 
 
 def _listed(file: Path, what: str, listed: object) -> Path:
@@ -221,12 +212,12 @@ def _lens(file: Path, values: dict[str, Any], photo: Path | None) -> Lens:
 
 
 def _focals(values: dict[str, Any], what: str, width: float, height: float) -> tuple[float, float]:
-    fx, fy = _number(values, "fl_x", what), _number(values, "fl_y", what)
-    angle_x, angle_y = _number(values, "camera_angle_x", what), _number(values, "camera_angle_y", what)
+    keys = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
+    fx, fy, angle_x, angle_y = (_number(values, key, what) for key in keys)
+    if fx is None and fy is None and angle_y:
+        fy = 0.5 * height / math.tan(0.5 * angle_y)
     if fx is None and angle_x:
         fx = 0.5 * width / math.tan(0.5 * angle_x)
-    if fy is None and angle_y and _number(values, "fl_x", what) is None:
-        fy = 0.5 * height / math.tan(0.5 * angle_y)
     fx = fy if fx is None else fx
     fy = fx if fy is None else fy
     if fx is None or fy is None or min(fx, fy) <= 0:

@@ -6,7 +6,6 @@ row as a smaller cloud, and allocates the size that a damaged header gives witho
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,48 +14,42 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.arrays import read_npz
 from perception.io.atomic import atomic_file
-from perception.io.ply import read_ply, write_ply
+from perception.io.ply import MOST_ROWS, Property, Table, packed, read_body, read_ply, write_ply
 from perception.machine import require_memory
 from perception.types import PointCloud
 
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 _NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 _NOT_LABELS = {"alpha", "diffuse_alpha", "a", "rgb", "rgba"}
-_PCD_SIZES = {"F": ("4", "8"), "I": ("1", "2", "4", "8"), "U": ("1", "2", "4", "8")}
-_PCD_MOST = 1 << 40
+_PCD_KINDS = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
+_PCD_COLUMNS = 1 << 12
 
 
 def read_cloud(path: str | Path) -> PointCloud:
     """Read .ply (cloud or mesh), .pcd or .npz.
-
-    points are float64 where the file stores doubles, else float32; integer columns besides the colours become
-    `labels`; faces of more than three corners are split into fans. NaN and infinite points are kept in place.
-    """
+    points are float64 where the file stores doubles, else float32; integer columns besides the colours become `labels`;
+    faces of more than three corners are split into fans. NaN and infinite points are kept in place."""
     path = Path(path)
-    reader = _READERS.get(path.suffix.lower())
-    if reader is None:
-        raise InputError(f"{path}: unknown point cloud format '{path.suffix}'; expected {', '.join(_READERS)}")
+    if path.suffix.lower() not in _FORMATS:
+        raise InputError(f"{path}: unknown point cloud format '{path.suffix}'; expected {', '.join(_FORMATS)}")
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; expected a point cloud")
     require_memory(4 * path.stat().st_size, str(path), "split the cloud, or use a machine with more memory")
-    cloud = reader(path)
+    cloud = _FORMATS[path.suffix.lower()][0](path)
     if len(cloud.points) == 0:
         raise InputError(f"{path}: holds no points")
-    if cloud.faces is not None and len(cloud.faces):
-        low, high = int(cloud.faces.min()), int(cloud.faces.max())
-        if low < 0 or high >= len(cloud.points):
-            bad = low if low < 0 else high
-            raise InputError(f"{path}: a face names vertex {bad}, but there are {len(cloud.points)} vertices")
+    bad = [] if cloud.faces is None else cloud.faces[(cloud.faces < 0) | (cloud.faces >= len(cloud.points))]
+    if len(bad):
+        raise InputError(f"{path}: a face names vertex {bad[0]}, but there are {len(cloud.points)} vertices")
     return cloud
 
 
 def write_cloud(path: str | Path, cloud: PointCloud) -> None:
     """Write .ply (binary), .pcd (binary) or .npz: points and those attributes that the format supports."""
     path = Path(path)
-    writer = _WRITERS.get(path.suffix.lower())
-    if writer is None:
-        raise InputError(f"{path}: cannot write the format '{path.suffix}'; expected {', '.join(_WRITERS)}")
-    writer(path, cloud)
+    if path.suffix.lower() not in _FORMATS:
+        raise InputError(f"{path}: cannot write the format '{path.suffix}'; expected {', '.join(_FORMATS)}")
+    _FORMATS[path.suffix.lower()][1](path, cloud)
 
 
 def to_int32(values: np.ndarray, where: str) -> np.ndarray:
@@ -82,9 +75,8 @@ def to_uint8(colors: np.ndarray) -> np.ndarray:
         clean = np.nan_to_num(colors)
         scale = 255.0 if clean.max(initial=0) <= 1.0 else 1.0
         return np.clip(np.round(clean * scale), 0, 255).astype(np.uint8)
-    if colors.max(initial=0) > 255:
-        return np.clip(np.round(colors / 257.0), 0, 255).astype(np.uint8)
-    return np.clip(colors, 0, 255).astype(np.uint8)
+    wide = colors.max(initial=0) > 255
+    return np.clip(np.round(colors / 257.0) if wide else colors, 0, 255).astype(np.uint8)
 
 
 def _cloud_of(columns: dict[str, np.ndarray], path: Path) -> PointCloud:
@@ -93,7 +85,7 @@ def _cloud_of(columns: dict[str, np.ndarray], path: Path) -> PointCloud:
     if not set("xyz") <= columns.keys():
         raise InputError(f"{path}: has the fields {', '.join(columns)[:200] or 'none'}; expected x, y and z")
     points = np.stack([columns[axis] for axis in "xyz"], axis=1)
-    cloud = PointCloud(points if points.dtype == np.float64 else points.astype(np.float32))
+    cloud = PointCloud(_floats(points))
     colors, normals = (next((n for n in kinds if set(n) <= columns.keys()), None) for kinds in (_COLORS, _NORMALS))
     packed = next((columns[name] for name in ("rgb", "rgba") if name in columns), None)
     if colors is not None:
@@ -110,9 +102,12 @@ def _cloud_of(columns: dict[str, np.ndarray], path: Path) -> PointCloud:
     return cloud
 
 
+def _floats(points: np.ndarray) -> np.ndarray:
+    return points if points.dtype == np.float64 else points.astype(np.float32, copy=False)
+
+
 def _columns_of(cloud: PointCloud, normals: tuple[str, ...]) -> dict[str, np.ndarray]:
-    points = cloud.points if cloud.points.dtype == np.float64 else cloud.points.astype(np.float32)
-    columns = {axis: points[:, i] for i, axis in enumerate("xyz")}
+    columns = dict(zip("xyz", _floats(cloud.points).T, strict=True))
     if cloud.normals is not None:
         columns |= {name: cloud.normals[:, i].astype(np.float32) for i, name in enumerate(normals)}
     return columns
@@ -155,7 +150,7 @@ def _read_npz(path: Path) -> PointCloud:
     if points is None or points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
         found = "none" if points is None else f"{points.dtype} {list(points.shape)}"
         raise InputError(f"{path}: expected an array 'points' [P, 3], found {found}")
-    cloud = PointCloud(points if points.dtype == np.float64 else points.astype(np.float32, copy=False))
+    cloud = PointCloud(_floats(points))
     for name, values in arrays.items():
         if name == "colors" and values.shape == points.shape:
             cloud.colors = to_uint8(values)
@@ -176,72 +171,47 @@ def _write_npz(path: Path, cloud: PointCloud) -> None:
         np.savez(file, **everything)
 
 
-def _read_pcd(path: Path) -> dict[str, np.ndarray]:
-    """The fields of COUNT 1, [P] each; packed rgb(a) as uint32. Fields named "_" are padding and left out."""
-    data = path.read_bytes()
-    header, at = _read_header(data, path)
-    dtype, points = _row_type(header, path)
-    kind = header["DATA"][0].lower() if header["DATA"] else ""
-    if kind == "ascii":
-        rows = _from_ascii(data[at:], dtype, points, path)
-    elif kind == "binary":
-        if len(data) - at < points * dtype.itemsize:
-            raise InputError(f"{path}: is cut short: {(len(data) - at) // dtype.itemsize} of {points} points are there")
-        rows = np.frombuffer(data, dtype, points, at)
-    else:
-        raise InputError(f"{path}: PCD DATA is '{kind}'; expected ascii or binary (pcl_convert_pcd_ascii_binary)")
-    columns = {name: rows[name] for name in dtype.names or () if rows[name].ndim == 1 and not name.startswith("_")}
-    for name in ("rgb", "rgba"):
-        if name in columns and columns[name].dtype.itemsize == 4:
-            columns[name] = np.ascontiguousarray(columns[name]).view(np.uint32)
-    return columns
-
-
-def _read_header(data: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
-    header: dict[str, list[str]] = {}
-    at = 0
+def _read_pcd(path: Path) -> PointCloud:
+    """The cloud of the fields of COUNT 1; rgb(a) is packed in 4 bytes. Fields named "_" are padding."""
+    data, at, header = path.read_bytes(), 0, dict[str, list[str]]()
     while "DATA" not in header:
         end = data.find(b"\n", at)
         if end < 0 or at > 1 << 16:
             raise InputError(f"{path}: PCD header has no DATA line")
-        words = data[at:end].decode("ascii", "replace").split()
+        name, *values = data[at:end].decode("ascii", "replace").split() or ["#"]
         at = end + 1
-        if words and not words[0].startswith("#"):
-            header[words[0].upper()] = words[1:]
-    return header, at
-
-
-def _row_type(header: dict[str, list[str]], path: Path) -> tuple[np.dtype, int]:
+        header[name.upper()] = values
+    kind = " ".join(header["DATA"]).lower()
+    if kind not in ("ascii", "binary"):
+        raise InputError(f"{path}: PCD DATA is '{kind}'; expected ascii or binary (pcl_convert_pcd_ascii_binary)")
     try:
-        names, sizes, types = header["FIELDS"], header["SIZE"], header["TYPE"]
-        counts = [int(c) for c in header.get("COUNT", ["1"] * len(names))]
-        points = int(header["POINTS"][0] if "POINTS" in header else header["WIDTH"][0])
-        fits = len(names) == len(sizes) == len(types) == len(counts)
-        if not fits or not 0 <= points <= _PCD_MOST or min(counts) < 1:
-            raise ValueError("FIELDS, SIZE, TYPE and COUNT disagree")
-        fields: list[tuple] = []
-        for i, (name, size, type_, count) in enumerate(zip(names, sizes, types, counts, strict=True)):
-            if size not in _PCD_SIZES[type_.upper()]:
-                raise ValueError(f"field '{name}' has SIZE {size} and TYPE {type_}")
-            unique = name if name not in names[:i] and name != "_" else f"_{name}{i}"
-            fields.append((unique, f"<{type_.lower()}{size}", *([(count,)] if count > 1 else [])))
-        return np.dtype(fields), points
+        table = _pcd_table(header)
     except (KeyError, IndexError, ValueError) as error:
         raise InputError(f"{path}: PCD header cannot be understood ({error})") from error
+    columns = read_body(path, data[at:], "<" if kind == "binary" else "", [table])[table.name]
+    columns = {name: values for name, values in columns.items() if not name.startswith("_")}
+    for name in {"rgb", "rgba"} & columns.keys():
+        if columns[name].dtype.itemsize == 4:
+            columns[name] = columns[name].view(np.uint32)
+    return _cloud_of(columns, path)
 
 
-def _from_ascii(data: bytes, dtype: np.dtype, points: int, path: Path) -> np.ndarray:
-    names = dtype.names or ()
-    widths = [int(np.prod(dtype[name].shape)) for name in names]
-    try:
-        table = np.fromstring(data, dtype=np.float64, sep=" ").reshape(points, sum(widths))
-    except ValueError as error:
-        raise InputError(f"{path}: PCD text does not hold {points} rows of numbers ({error})") from error
-    rows = np.empty(points, dtype)
-    with np.errstate(invalid="ignore"):
-        for name, block in zip(names, np.split(table, np.cumsum(widths)[:-1], axis=1), strict=True):
-            rows[name] = block.reshape(rows[name].shape)
-    return rows
+def _pcd_table(header: dict[str, list[str]]) -> Table:
+    """The columns of a PCD; "_" begins the names of those that are not read: padding, repeated names, vectors."""
+    names, sizes, types = header["FIELDS"], header["SIZE"], header["TYPE"]
+    counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
+    rows = int((header.get("POINTS") or header["WIDTH"])[0])
+    if not 0 <= rows <= MOST_ROWS or min(counts) < 1 or sum(counts) > _PCD_COLUMNS:
+        raise ValueError(f"{rows} points of {sum(counts)} numbers")
+    columns: list[Property] = []
+    for i, (name, size, letter, count) in enumerate(zip(names, sizes, types, counts, strict=True)):
+        if (kind := f"{letter.lower()}{size}") not in _PCD_KINDS:
+            raise ValueError(f"field '{name}' has SIZE {size} and TYPE {letter}")
+        if count == 1 and name not in names[:i] and name != "_":
+            columns.append(Property(name, kind))
+        else:
+            columns += [Property(f"_{i}_{number}", kind) for number in range(count)]
+    return Table("points", rows, columns)
 
 
 def _write_pcd(path: Path, cloud: PointCloud) -> None:
@@ -251,7 +221,7 @@ def _write_pcd(path: Path, cloud: PointCloud) -> None:
         r, g, b = cloud.colors.astype(np.uint32).T
         columns["rgb"] = ((r << 16) | (g << 8) | b).view(np.float32)
     columns |= {name: values.astype(np.int32) for name, values in cloud.labels.items()}
-    rows = np.rec.fromarrays(list(columns.values()), names=list(columns))  # type: ignore[call-overload]
+    rows = packed(columns)
     kinds = [rows.dtype[name] for name in columns]
     header = (
         "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\n"
@@ -266,13 +236,9 @@ def _write_pcd(path: Path, cloud: PointCloud) -> None:
         rows.tofile(file)
 
 
-_READERS: dict[str, Callable[[Path], PointCloud]] = {
-    ".ply": _read_ply_cloud,
-    ".pcd": lambda path: _cloud_of(_read_pcd(path), path),
-    ".npz": _read_npz,
+_FORMATS: dict[str, Any] = {
+    ".ply": (_read_ply_cloud, _write_ply_cloud),
+    ".pcd": (_read_pcd, _write_pcd),
+    ".npz": (_read_npz, _write_npz),
 }
-_WRITERS: dict[str, Callable[[Path, PointCloud], None]] = {
-    ".ply": _write_ply_cloud,
-    ".pcd": _write_pcd,
-    ".npz": _write_npz,
-}
+"""The functions that read and write a format."""

@@ -57,18 +57,14 @@ def read_yaml(file: Path, expected: str) -> Any:
                 raise yaml.YAMLError("aliases are not taken")
             return super().compose_node(parent, index)
 
-    try:
+    with refusing(f"{file}: not readable YAML ({{why}}); expected {expected}"):
         return yaml.load(file.read_text(encoding="utf-8"), Loader)
-    except FileNotFoundError as error:
-        raise InputError(f"{file}: no such file; expected {expected}") from error
-    except (yaml.YAMLError, *DAMAGE) as error:
-        raise InputError(f"{file}: not readable YAML ({brief(error)}); expected {expected}") from error
 
 
 @contextmanager
 def refusing(message: str) -> Iterator[None]:
     """For the calls of a library that decodes untrusted bytes: whatever it raises becomes an InputError.
-    message: of that error; "{why}" in it stands for what the library said. An InputError passes as it is."""
+    message: of that error; "{why}" in it stands for the library's message. An InputError passes as it is."""
     try:
         yield
     except InputError:

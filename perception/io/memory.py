@@ -1,4 +1,4 @@
-"""Arrays of which a bounded part is in memory: photos and labels of a large place."""
+"""Arrays of which a bounded part is in memory: photos and labels of a large scene."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def _new_file(folder: Path, size: int) -> mmap.mmap:
 
 
 def mapped_bytes() -> int:
-    """Bytes of mapped files that are resident in this process; very many where the system does not tell."""
+    """Bytes of mapped files that are resident in this process; very many where the system does not report it."""
     try:
         return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[2]) * mmap.PAGESIZE
     except OSError:

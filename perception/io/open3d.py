@@ -1,4 +1,4 @@
-"""Open3D, an optional package: the one place that imports it."""
+"""Open3D, an optional package: the only file that imports it."""
 
 from __future__ import annotations
 
@@ -45,9 +45,7 @@ def tensor_cloud(points: np.ndarray, colors: np.ndarray | None, instance_ids: np
 def fuse_depth(shots: Iterable[Shot], voxel: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(vertices [V, 3] float32, colors [V, 3] uint8, faces [F, 3] int32) of the zero level of a truncated signed
     distance field (Curless & Levoy 1996) with voxels of this size and a truncation of four, where two views saw it.
-
-    Vertices and faces are sorted, as Open3D's order depends on its threads.
-    """
+    Vertices and faces are sorted, as Open3D's order depends on its threads."""
     o3d = load_open3d()
     tensor, single = o3d.core.Tensor, o3d.core.float32
     names, kinds, widths = ("tsdf", "weight", "color"), (single,) * 3, ((1), (1), (3))
@@ -82,9 +80,9 @@ def write_glb(path: Path, points: np.ndarray, colors: np.ndarray, faces: np.ndar
 
 def _sorted(points: np.ndarray, colors: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     order = np.lexsort((*colors.T, *points.T))
-    place = np.empty(len(order), np.int32)
-    place[order] = np.arange(len(order), dtype=np.int32)
-    faces = place[faces]
+    rank = np.empty(len(order), np.int32)
+    rank[order] = np.arange(len(order), dtype=np.int32)
+    faces = rank[faces]
     first = faces.argmin(axis=1)[:, None]  # turned, not flipped, so that the smallest is first
     faces = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
     return points[order], colors[order], faces[np.lexsort(faces.T[::-1])]

@@ -17,43 +17,36 @@ from perception.io.atomic import atomic_file
 
 Element = dict[str, np.ndarray]
 
-_KINDS = {
-    **dict.fromkeys(("char", "int8"), "i1"),
-    **dict.fromkeys(("uchar", "uint8"), "u1"),
-    **dict.fromkeys(("short", "int16"), "i2"),
-    **dict.fromkeys(("ushort", "uint16"), "u2"),
-    **dict.fromkeys(("int", "int32"), "i4"),
-    **dict.fromkeys(("uint", "uint32"), "u4"),
-    **dict.fromkeys(("float", "float32"), "f4"),
-    **dict.fromkeys(("double", "float64"), "f8"),
-}
 _NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"}
 _NAMES |= {"f4": "float", "f8": "double"}
+_KINDS = {name: kind for kind, name in _NAMES.items()} | {np.dtype(kind).name: kind for kind in _NAMES}
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 _MAX_HEADER = 1 << 20
-_MOST_ROWS = 1 << 40
+MOST_ROWS = 1 << 40
 
 
 @dataclass(frozen=True)
-class _Property:
+class Property:
+    """kind: "f4", "u1", … count: the type of a list's length, None for a scalar."""
+
     name: str
-    kind: str  # "f4", "u1", ...
-    count: str | None = None  # the type of a list's length; None for a scalar
+    kind: str
+    count: str | None = None
 
 
-@dataclass
-class _Table:
+@dataclass(frozen=True)
+class Table:
+    """An element as its header describes it."""
+
     name: str
     rows: int
-    properties: list[_Property]
+    properties: list[Property]
 
 
 def read_ply(path: str | Path) -> dict[str, Element]:
     """All elements of a PLY file: {element: {property: array}}, file order kept, native byte order.
-
-    A scalar property is an array [rows]; a list property is [rows, k] when all its lists have the same length
-    k and an object array of 1D arrays otherwise.
-    """
+    A scalar property is an array [rows]; a list property is [rows, k] when all its lists have the same length k and an
+    object array of 1D arrays otherwise."""
     path = Path(path)
     try:
         with path.open("rb") as file:
@@ -61,11 +54,19 @@ def read_ply(path: str | Path) -> dict[str, Element]:
             body = file.read()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); expected a PLY file") from error
+    return read_body(path, body, order, tables)
+
+
+def read_body(path: Path, body: bytes, order: str, tables: list[Table]) -> dict[str, Element]:
+    """The tables that follow a header, as `read_ply` returns them. order: of bytes, "<" or ">"; "" for text."""
     try:
         source = _Body(body, order)
     except ValueError as error:
         raise InputError(f"{path}: holds text where numbers are expected ({error})") from error
-    return {table.name: _read_element(source, table, path) for table in tables}
+    elements = {table.name: _read_element(source, table, path) for table in tables}
+    if source.text and source.at < len(source.body):
+        raise InputError(f"{path}: holds more numbers than its header says; it is damaged")
+    return elements
 
 
 def map_ply(path: str | Path, element: str) -> np.ndarray:
@@ -92,51 +93,52 @@ def write_ply(path: str | Path, elements: Mapping[str, Mapping[str, np.ndarray]]
     with atomic_file(path) as new, new.open("wb") as file:
         file.write(_header(elements))
         for properties in elements.values():
-            _packed(properties).tofile(file)
+            packed(properties).tofile(file)
 
 
 def ply_bytes(elements: Mapping[str, Mapping[str, np.ndarray]]) -> bytes:
     """The bytes of the file that `write_ply` writes, for example to send them over a network."""
-    return _header(elements) + b"".join(_packed(p).tobytes() for p in elements.values())
+    return _header(elements) + b"".join(packed(p).tobytes() for p in elements.values())
 
 
-def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[_Table]]:
+def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Table]]:
     if file.readline(16).strip() != b"ply":
         raise InputError(f"{path}: is not a PLY file: its first line is not 'ply'")
     order: str | None = None
-    tables: list[_Table] = []
+    tables: list[Table] = []
     while file.tell() < _MAX_HEADER:
         line = file.readline(4096)
-        words = line.decode("ascii", "replace").split()
-        if not line or words == ["end_header"]:
+        fields = line.decode("ascii", "replace").split()
+        if not line or fields == ["end_header"]:
             break
         try:
-            if not words or words[0] in ("comment", "obj_info"):
-                continue
-            if words[0] == "format":
-                order = _ORDERS[words[1]]
-            elif words[0] == "element":
-                tables.append(_Table(words[1], int(words[2]), []))
-            elif words[0] == "property" and words[1] == "list":
-                tables[-1].properties.append(_Property(words[4], _KINDS[words[3]], _KINDS[words[2]]))
-            elif words[0] == "property":
-                tables[-1].properties.append(_Property(words[2], _KINDS[words[1]]))
+            match fields:
+                case ["format", name, *_]:
+                    order = _ORDERS[name]
+                case ["element", name, rows, *_]:
+                    tables.append(Table(name, int(rows), []))
+                case ["property", "list", count, kind, name, *_]:
+                    tables[-1].properties.append(Property(name, _KINDS[kind], _KINDS[count]))
+                case ["property", kind, name, *_]:
+                    tables[-1].properties.append(Property(name, _KINDS[kind]))
+                case ["format" | "element" | "property", *_]:
+                    raise ValueError("too few fields")
         except (KeyError, IndexError, ValueError) as error:
-            raise InputError(f"{path}: PLY header line {' '.join(words)!r} cannot be understood") from error
-    if words != ["end_header"] or order is None:
+            raise InputError(f"{path}: PLY header line {' '.join(fields)!r} cannot be understood") from error
+    if fields != ["end_header"] or order is None:
         raise InputError(f"{path}: PLY header is cut short: no 'format' or no 'end_header' line")
     for table in tables:
         names = [p.name for p in table.properties]
-        if len(set(names)) != len(names) or not names or not 0 <= table.rows <= _MOST_ROWS:
+        if len(set(names)) != len(names) or not names or not 0 <= table.rows <= MOST_ROWS:
             raise InputError(
                 f"{path}: element '{table.name}' of {table.rows} rows with {len(names)} properties: expected 0 to "
-                f"{_MOST_ROWS} rows and properties of distinct names"
+                f"{MOST_ROWS} rows and properties of distinct names"
             )
     return order, tables
 
 
 class _Body:
-    """Values of a body, taken one after another. The numbers of a text are float64, whatever the header says."""
+    """Values of a body, taken one after another. The numbers of a text are float64, whatever their type."""
 
     def __init__(self, body: bytes, order: str):
         self.order, self.text, self.at = order, not order, 0
@@ -151,7 +153,7 @@ class _Body:
         self.at += found.nbytes
         return found
 
-    def block(self, table: _Table, lengths: dict[str, int]) -> tuple[Element | None, int]:
+    def block(self, table: Table, lengths: dict[str, int]) -> tuple[Element | None, int]:
         """All rows if they have lists of these lengths, else None; the number of such rows that fit into the body."""
         fields: list[tuple] = []
         for p in table.properties:
@@ -172,11 +174,11 @@ class _Body:
 
 
 def _cast(values: np.ndarray, kind: str) -> np.ndarray:
-    with np.errstate(invalid="ignore"):  # a text may hold nan where the header says int
+    with np.errstate(invalid="ignore"):  # a text may hold nan of type int
         return values.astype(kind)
 
 
-def _read_element(source: _Body, table: _Table, path: Path) -> Element:
+def _read_element(source: _Body, table: Table, path: Path) -> Element:
     """One element, as a table if all lists of a property are as long as the first, else value by value."""
     start, listed = source.at, [p.name for p in table.properties if p.count]
     try:
@@ -193,15 +195,15 @@ def _read_element(source: _Body, table: _Table, path: Path) -> Element:
     return {p.name: _column([row[p.name] for row in each], p) for p in table.properties}
 
 
-def _cut_short(path: Path, table: _Table, found: int) -> str:
-    return f"{path}: is cut short: element '{table.name}' has {found} whole rows, header says {table.rows}"
+def _cut_short(path: Path, table: Table, found: int) -> str:
+    return f"{path}: is cut short: element '{table.name}' has {found} complete rows, its header says {table.rows}"
 
 
-def _take_row(source: _Body, table: _Table) -> Element:
+def _take_row(source: _Body, table: Table) -> Element:
     return {p.name: source.take(p.kind, int(source.take(p.count, 1)[0]) if p.count else 1) for p in table.properties}
 
 
-def _column(values: list[np.ndarray], p: _Property) -> np.ndarray:
+def _column(values: list[np.ndarray], p: Property) -> np.ndarray:
     if p.count is None:
         return _cast(np.concatenate(values), p.kind)
     if len({len(v) for v in values}) == 1:
@@ -228,8 +230,9 @@ def _header(elements: Mapping[str, Mapping[str, np.ndarray]]) -> bytes:
     return "\n".join([*lines, "end_header", ""]).encode("ascii")
 
 
-def _packed(properties: Mapping[str, np.ndarray]) -> np.ndarray:
-    fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
+def packed(properties: Mapping[str, np.ndarray]) -> np.ndarray:
+    """The rows of a table as a structured array, little endian; each list after its length."""
+    fields: list[tuple] = []
     for key, values in properties.items():
         if values.ndim == 2:
             fields += [(f"{key}\0count", "u1"), (key, "<" + _kind(values), (values.shape[1],))]

@@ -40,10 +40,8 @@ def model_root(folder: Path) -> Path:
 
 def model_graphs(folder: Path) -> tuple[list[Path], list[Path]]:
     """The ONNX files of a model folder and its subfolders (`onnx/`, `visual/`), and those left out.
-
     Of files that differ only in precision (`model.onnx`, `model_fp16.onnx`, `model_quantized.onnx`) the most precise
-    one is the model's. InputError where there is none.
-    """
+    one is the model's. InputError where there is none."""
     root, best = model_root(folder), dict[tuple[Path, str], Path]()
     found = sorted([*root.glob("*.onnx"), *root.glob("*/*.onnx")], key=lambda path: _PRECISIONS.index(_precision(path)))
     if not found:
@@ -70,19 +68,22 @@ def side_files(path: Path) -> list[Path]:
 
 def refuse_outside_weights(path: Path) -> None:
     """InputError for an ONNX file whose weights lie outside its folder, as no public export has them."""
-    outside = next((name for name in _weights(path) if not _lies_beside(path, name)), None)
-    if outside is not None:
-        raise InputError(f"{path}: its weights are in {outside[:200]!r}, outside its folder; expected a file beside it")
+    for name in _weights(path):
+        if not _lies_beside(path, name):
+            raise InputError(
+                f"{path}: its weights are in {name[:200]!r}, outside its folder; expected a file beside it"
+            )
 
 
-def _weights(path: Path) -> list[str]:
+def _weights(path: Path) -> dict[str, None]:
+    """Names of the files in order, each once."""
     names = dict[str, None]()
     if path.stat().st_size:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
             for match in _LOCATION.finditer(data):
-                size = sum((byte & 127) << 7 * place for place, byte in enumerate(match[1]))
+                size = sum((byte & 127) << 7 * number for number, byte in enumerate(match[1]))
                 names[data[match.end() : match.end() + min(size, _LONGEST)].decode("utf-8", "replace")] = None
-    return list(names)
+    return names
 
 
 def _lies_beside(path: Path, name: str) -> bool:
@@ -96,12 +97,9 @@ def _lies_beside(path: Path, name: str) -> bool:
 
 def read_config(model: Path, name: str) -> dict[str, Any]:
     """A JSON file in the model's folder or its parent (graphs often lie in `onnx/`); {} if there is none."""
-    for folder in (model.parent, model.parent.parent):
-        path = folder / name
-        if path.is_file():
-            known = read_json(path)
-            return known if isinstance(known, dict) else {}
-    return {}
+    path = next((folder / name for folder in model.parents[:2] if (folder / name).is_file()), None)
+    known = None if path is None else read_json(path)
+    return known if isinstance(known, dict) else {}
 
 
 def open_session(path: Path, threads: int = 0) -> Any:
@@ -162,14 +160,14 @@ def shape_of(value: Any) -> list[int | None]:
 
 def signature(session: Any) -> str:
     """Inputs and outputs with their shapes, for messages."""
-    inputs = ", ".join(f"{value.name}{value.shape}" for value in session.get_inputs())
-    outputs = ", ".join(f"{value.name}{value.shape}" for value in session.get_outputs())
+    sides = (session.get_inputs(), session.get_outputs())
+    inputs, outputs = (", ".join(f"{value.name}{value.shape}" for value in side) for side in sides)
     return f"inputs {inputs}; outputs {outputs}"
 
 
 def fingerprint(path: Path) -> str:
     """12 hex digits of the size, the first and the last MiB of a model and of its side files.
-    This distinguishes weights without reading the whole files, which can be gigabytes."""
+    This distinguishes weights without reading all of them, which can be gigabytes."""
     digest = hashlib.sha256()
     for part in (path, *side_files(path)):
         size = part.stat().st_size

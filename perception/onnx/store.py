@@ -59,9 +59,7 @@ def models_folder() -> Path:
 
 def stored_models() -> list[StoredModel]:
     """All stored models, sorted by name."""
-    if not models_folder().is_dir():
-        return []
-    found = (find_model(folder.name) for folder in sorted(models_folder().iterdir()))
+    found = (find_model(folder.name) for folder in sorted(models_folder().glob("*")))
     return [model for model in found if model is not None]
 
 

@@ -8,84 +8,78 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.atomic import atomic_file
 from perception.io.documents import brief, read_yaml
 from perception.photos.lens import MOST_SIDE, opencv_lens
 from perception.types import Lens
 
 _COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
+"""Numbers of coefficients by distortion model."""
 
 
 def read_camera(path: Path) -> Lens:
-    """The lens in a camera_info file, in pixels; distortion models plumb_bob, rational_polynomial, equidistant.
+    """The lens in a camera_info file, in pixels; InputError as `lens_of`."""
+    return lens_of(read_yaml(path, "ROS camera_info"), path)
 
+
+def lens_of(data: Any, where: object) -> Lens:
+    """The lens of a camera_info; distortion models plumb_bob, rational_polynomial, equidistant.
     The centre of the first pixel is (0, 0) in ROS and OpenCV and (0.5, 0.5) in COLMAP and this project, so 0.5 is added
-    to the principal point.
-    """
-    path = Path(path)
-    data = read_yaml(path, "ROS camera_info")
+    to the principal point. InputError that names `where` for values that are missing or describe no camera."""
     if not isinstance(data, dict):
-        raise InputError(f"{path}: expected a ROS camera_info mapping with image_width, image_height, camera_matrix")
-    width, height = (int(_numbers(data.get(key), 1, path, key)[0]) for key in ("image_width", "image_height"))
-    matrix = _numbers(_data(data, "camera_matrix"), 9, path, "camera_matrix.data").reshape(3, 3)
+        raise InputError(f"{where}: expected a ROS camera_info mapping with image_width, image_height, camera_matrix")
+    width, height = (int(_numbers(data.get(key), 1, where, key)[0]) for key in ("image_width", "image_height"))
+    matrix = _numbers(_data(data, "camera_matrix"), 9, where, "camera_matrix.data").reshape(3, 3)
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5
     if min(width, height) < 1 or max(width, height) > MOST_SIDE or min(fx, fy) <= 0:
         sides = f"{width:.6g}×{height:.6g}, {fx:g}, {fy:g}"
-        raise InputError(f"{path}: image sides must be 1 to {MOST_SIDE} pixels, focal lengths positive; found {sides}")
+        raise InputError(f"{where}: image sides must be 1 to {MOST_SIDE} pixels, focal lengths positive; found {sides}")
     name = data.get("distortion_model", "plumb_bob")
     if not isinstance(name, str) or name not in _COUNTS:
-        raise InputError(f"{path}: distortion_model {brief(name)} is not known; expected one of {', '.join(_COUNTS)}")
+        raise InputError(f"{where}: distortion_model {brief(name)} is not known; expected one of {', '.join(_COUNTS)}")
     values = _data(data, "distortion_coefficients")
     found = len(values) if isinstance(values, (list, tuple)) else 0
     if found not in _COUNTS[name]:
         expected = " or ".join(map(str, _COUNTS[name]))
-        raise InputError(f"{path}: {name} has {expected} distortion_coefficients, found {found}")
-    k = _numbers(values, found, path, "distortion_coefficients.data").tolist()
+        raise InputError(f"{where}: {name} has {expected} distortion_coefficients, found {found}")
+    k = _numbers(values, found, where, "distortion_coefficients.data").tolist()
     return opencv_lens((float(fx), float(fy), float(cx), float(cy)), k, width, height, name == "equidistant")
 
 
-def write_camera(path: Path, name: str, model: str, size: tuple[int, int], values: np.ndarray) -> None:
-    """Writes a ROS camera_info YAML; size: (width, height) in pixels.
-
-    model "pinhole": values fx fy cx cy k1 k2 p1 p2 k3 (plumb_bob); "fisheye": fx fy cx cy k1 k2 k3 k4 (equidistant);
-    the principal point in the convention of OpenCV and ROS, with the centre of the first pixel at (0, 0). The rectified
-    camera is written equal to the camera.
-    """
-    fx, fy, cx, cy = (float(v) for v in values[:4])
-    kind = "equidistant" if model == "fisheye" else "plumb_bob"
-    _write(path, name, size, kind, [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], [float(v) for v in values[4:]])
-
-
-def write_camera_info(path: Path, message: Any, rectified: bool = False) -> None:
-    """Writes a ROS CameraInfo message (ROS 1 or 2) as a camera file; rectified: from its projection matrix P."""
+def camera_info(message: Any, rectified: bool = False) -> dict[str, Any]:
+    """The camera_info of a ROS CameraInfo message (ROS 1 or 2); rectified: by its projection matrix P."""
 
     def field(name: str) -> list[float]:
         values = getattr(message, name.lower(), None)
         return [float(v) for v in (getattr(message, name.upper()) if values is None else values)]
 
-    K, distortion, kind = field("k"), field("d"), str(message.distortion_model) or "plumb_bob"
+    size, kind = (int(message.width), int(message.height)), str(message.distortion_model) or "plumb_bob"
     if rectified:
         P = field("p")
-        K, distortion, kind = [*P[0:3], *P[4:7], *P[8:11]], [0.0] * 5, "plumb_bob"
-    size = (int(message.width), int(message.height))
-    _write(path, path.stem, size, kind, K, distortion or [0.0] * 5)
+        return camera_data("camera", size, "plumb_bob", [*P[0:3], *P[4:7], *P[8:11]], [0.0] * 5)
+    return camera_data("camera", size, kind, field("k"), field("d") or [0.0] * 5)
 
 
-def _write(path: Path, name: str, size: tuple[int, int], kind: str, K: list[float], distortion: list[float]) -> None:
-    import yaml
-
-    from perception.io.atomic import atomic_file
-
+def camera_data(name: str, size: tuple[int, int], kind: str, K: list[float], distortion: list[float]) -> dict[str, Any]:
+    """The camera_info of intrinsics K, row by row, in the convention of OpenCV and ROS: the centre of the first pixel
+    is (0, 0). size: (width, height). kind: of the distortion. The rectified camera is the same camera."""
     blocks = {
         "camera_matrix": (3, 3, K),
         "distortion_coefficients": (1, len(distortion), distortion),
         "rectification_matrix": (3, 3, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
         "projection_matrix": (3, 4, [*K[0:3], 0.0, *K[3:6], 0.0, *K[6:9], 0.0]),
     }
-    data: dict[str, Any] = {"image_width": int(size[0]), "image_height": int(size[1]), "camera_name": name}
-    data["distortion_model"] = kind
-    data |= {key: {"rows": r, "cols": c, "data": numbers} for key, (r, c, numbers) in blocks.items()}
+    data = {"image_width": size[0], "image_height": size[1], "camera_name": name, "distortion_model": kind}
+    return data | {key: {"rows": r, "cols": c, "data": numbers} for key, (r, c, numbers) in blocks.items()}
+
+
+def write_camera(path: Path, data: dict[str, Any]) -> None:
+    """Writes a camera_info as YAML."""
+    import yaml
+
+    text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None)
     with atomic_file(path) as new:
-        new.write_text(yaml.safe_dump(data, sort_keys=False, default_flow_style=None), encoding="utf-8")
+        new.write_text(text, encoding="utf-8")
 
 
 def _data(data: dict[str, Any], key: str) -> Any:
@@ -93,11 +87,11 @@ def _data(data: dict[str, Any], key: str) -> Any:
     return block.get("data") if isinstance(block, dict) else block
 
 
-def _numbers(value: Any, count: int, path: Path, key: str) -> np.ndarray:
+def _numbers(value: Any, count: int, where: object, key: str) -> np.ndarray:
     try:
         array = np.asarray(value, dtype=np.float64).ravel()
     except (TypeError, ValueError, OverflowError):
         array = np.empty(0)
     if array.size != count or not np.isfinite(array).all():
-        raise InputError(f"{path}: {key} must hold {count} finite number(s), found {brief(value)}")
+        raise InputError(f"{where}: {key} must hold {count} finite number(s), found {brief(value)}")
     return array

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import threading
 import warnings
+from collections.abc import MutableMapping
 from pathlib import Path
 from stat import S_ISREG
 from typing import Any
@@ -16,7 +17,7 @@ from PIL import Image, ImageOps, TiffImagePlugin, UnidentifiedImageError
 from perception.errors import InputError, missing_extra
 from perception.io.documents import refusing
 from perception.photos.lens import warp_grid
-from perception.types import View
+from perception.types import Lens, View
 
 HEIF_SUFFIXES = frozenset({".heic", ".heif", ".hif"})
 SUFFIXES = HEIF_SUFFIXES | {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
@@ -27,7 +28,7 @@ MOST_DECODED = 400_000_000
 _DENSEST = 8 * 1032
 """Most pixels that a byte of a file in one of _BOUNDED can hold: deflate's densest code, at one bit a pixel."""
 _BOUNDED = ("PNG", "JPEG", "MPO", "BMP", "GIF")
-# What these libraries say of a damaged file on the standard error, an InputError says.
+# These libraries report damaged files on the standard error; here an InputError does.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 warnings.filterwarnings("ignore", category=UserWarning, module="PIL")
 
@@ -37,7 +38,7 @@ def photo_size(path: Path) -> tuple[int, int]:
     with open_photo(path) as image:
         tags = getattr(image, "tag_v2", {})  # depending on its version, Pillow has rotated the size of a TIFF
         size = reduced_size(int(tags.get(0x0100, image.width)), int(tags.get(0x0101, image.height)), _reduction(image))
-        turned = exif_of(image, path).get(0x0112) in (5, 6, 7, 8)  # other values do not swap the sides
+        turned = exif_of(image, path).get(ORIENTATION) in (5, 6, 7, 8)  # other values do not swap the sides
         return size[::-1] if turned else size
 
 
@@ -61,18 +62,14 @@ def _reduction(image: Image.Image) -> int:
 
 
 _BAD_EXIF = "the photo's EXIF data are damaged; save it anew without them, or remove it"
+ORIENTATION, CAMERA_FOLDER, GPS_FOLDER = 0x0112, 0x8769, 0x8825
+"""EXIF tags: the rotation, and the folders of the tags on the exposure and on the position."""
 
 
-def exif_of(image: Image.Image, path: Path) -> Image.Exif:
-    """The EXIF data of an open photo, empty if it has none. Raises InputError if they are damaged."""
+def exif_of(image: Image.Image, path: Path, folder: int | None = None) -> MutableMapping[int, Any]:
+    """The EXIF data of an open photo, or of a folder in them; empty if there are none. InputError if damaged."""
     with refusing(f"{path}: {_BAD_EXIF}"):
-        return image.getexif()
-
-
-def exif_folder(image: Image.Image, path: Path, tag: int) -> dict[int, Any]:
-    """One of the folders of `exif_of` by its tag, empty if it is not there."""
-    with refusing(f"{path}: {_BAD_EXIF}"):
-        return image.getexif().get_ifd(tag)
+        return image.getexif() if folder is None else image.getexif().get_ifd(folder)
 
 
 def upright(image: Image.Image, path: Path) -> Image.Image:
@@ -82,7 +79,7 @@ def upright(image: Image.Image, path: Path) -> Image.Image:
 
 
 def why_left_out(path: Path, strict: bool = False) -> str | None:
-    """The error that reading the whole photo raises, or None; strict: raised. JPEG is read at 1/8 size: every byte."""
+    """The error that reading the photo raises, or None; strict: raised. JPEG is read at 1/8 size: every byte."""
     try:
         with open_photo(path) as image:
             image.draft("RGB", reduced_size(*image.size, 8))
@@ -96,12 +93,13 @@ def why_left_out(path: Path, strict: bool = False) -> str | None:
 
 def read_photo(path: Path) -> np.ndarray:
     """The photo as uint8 [h, w, 3] RGB, rotated as in EXIF; (w, h) = photo_size(path).
-
     Grey is repeated to three channels, 16 bits become 8 (v / 257 rounded), palettes are expanded; transparent pixels
-    are composited on black. Floating-point images are refused. HEIC needs pillow-heif (extra "heic").
-    """
+    are composited on black. Floating-point images are refused. HEIC needs pillow-heif (extra "heic")."""
     with open_photo(path) as image:
-        factor = _draft(image)
+        factor, (width, height) = _reduction(image), image.size
+        if factor > 1:
+            image.draft(None, (width // factor, height // factor))  # only JPEG is decoded at a reduced size
+            factor = max(1, round(factor * image.width / width))
         decode(image, path)
         photo = to_rgb(upright(image, path), path)
     return photo if factor == 1 else np.array(Image.fromarray(photo).reduce(factor))
@@ -110,16 +108,6 @@ def read_photo(path: Path) -> np.ndarray:
 def read_grey(path: Path) -> np.ndarray:
     """`read_photo` as uint8 [h, w] grey."""
     return np.asarray(cv2.cvtColor(read_photo(path), cv2.COLOR_RGB2GRAY))
-
-
-def _draft(image: Image.Image) -> int:
-    """Prepares an open photo to be decoded at its reduced size if its format can; returns the factor that remains."""
-    factor = _reduction(image)
-    if factor > 1:
-        width, height = image.size
-        image.draft(None, (width // factor, height // factor))
-        factor = max(1, round(factor * image.width / width))
-    return factor
 
 
 def scaled_size(view: View, max_side: int | None) -> tuple[int, int]:
@@ -137,10 +125,8 @@ def scaled_K(view: View, width: int, height: int) -> np.ndarray:
 
 def load_photo(view: View, max_side: int | None = None) -> np.ndarray:
     """The view's picture as uint8 [h, w, 3] RGB through its ideal pinhole, (w, h) = scaled_size(view, max_side).
-
     The photo is downscaled by area averaging, then undistorted with bilinear interpolation. Only the last warps are
-    cached. A photo is used without EXIF rotation if only then its size fits the camera (COLMAP ignores EXIF).
-    """
+    cached. A photo is used without EXIF rotation if only then its size fits the camera (COLMAP ignores EXIF)."""
     width, height = scaled_size(view, max_side)
     photo = _oriented(view)
     if view.lens is None:
@@ -149,7 +135,7 @@ def load_photo(view: View, max_side: int | None = None) -> np.ndarray:
     small_w = min(w, max(1, round(w * width / view.width)))
     small_h = min(h, max(1, round(h * height / view.height)))
     small = _shrink(photo, small_w, small_h)
-    x, y = _grid(view, width, height)
+    x, y = _grid(view, view.lens, width, height)
     map_x = x * np.float32(small_w / w) - np.float32(0.5)  # cv2 has pixel centres at integers
     map_y = y * np.float32(small_h / h) - np.float32(0.5)
     return cv2.remap(small, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -163,20 +149,30 @@ def warp_labels(view: View, labels: np.ndarray, width: int, height: int) -> np.n
         found = "×".join(map(str, labels.shape[::-1]))
         raise InputError(f"{view.name}: the label image is {found}, expected {across}×{down} like the photo")
     if view.lens is None:
-        column = ((np.arange(width) + 0.5) * view.width / width).astype(np.int64)
-        row = ((np.arange(height) + 0.5) * view.height / height).astype(np.int64)
-        return labels[row[:, None], column[None, :]].astype(np.int32)
-    x, y = _grid(view, width, height)
-    inside = (x >= 0) & (y >= 0) & (x < across) & (y < down)
-    warped = np.zeros((height, width), np.int32)
-    warped[inside] = labels[y[inside].astype(np.int64), x[inside].astype(np.int64)]
-    return warped
+        return nearest(labels, width, height).astype(np.int32)
+    return warped(labels, view, view.lens, width, height).astype(np.int32)
 
 
-def _grid(view: View, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    assert view.lens is not None
+def nearest(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """image [H, W] at another size [height, width]: each pixel takes the value at its centre."""
+    column = ((np.arange(width) + 0.5) * image.shape[1] / width).astype(np.int64)
+    row = ((np.arange(height) + 0.5) * image.shape[0] / height).astype(np.int64)
+    return image[row[:, None], column[None, :]]
+
+
+def warped(image: np.ndarray, view: View, lens: Lens, width: int, height: int) -> np.ndarray:
+    """image [H, W] that `lens` took at the view's pose, in the view's pinhole [height, width]: the nearest pixel on
+    each ray, so that no values are mixed across an edge; 0 outside of the image."""
+    x, y = _grid(view, lens, width, height)
+    inside = (x >= 0) & (y >= 0) & (x < image.shape[1]) & (y < image.shape[0])
+    result = np.zeros((height, width), image.dtype)
+    result[inside] = image[y[inside].astype(np.int64), x[inside].astype(np.int64)]
+    return result
+
+
+def _grid(view: View, lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     K = scaled_K(view, width, height)
-    return warp_grid(view.lens, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), width, height)
+    return warp_grid(lens, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), width, height)
 
 
 def _oriented(view: View) -> np.ndarray:
@@ -252,15 +248,14 @@ def check_size(where: object, size: tuple[int, int], kind: str | None, held: int
 def read_picture(source: Path | bytes, where: object, what: str, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray:
     """A file or the bytes of one, as OpenCV decodes it: BGR, or with its own depth and channels by IMREAD_UNCHANGED.
     InputError "`where`: not a readable `what`" for a file that is missing, of an unknown format, or damaged."""
-    wrong = f"{where}: not a readable {what}"
-    with refusing(wrong):
+    with refusing(f"{where}: not a readable {what}"):
         if isinstance(source, Path) and not source.is_file():
-            raise InputError(wrong)
+            raise ValueError("no file")
         data = source.read_bytes() if isinstance(source, Path) else source
         check_size(where, *_claims(data), len(data))
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
         if picture is None:
-            raise InputError(wrong)
+            raise ValueError("OpenCV does not read it")
         return np.asarray(picture)
 
 

@@ -10,21 +10,19 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.arrays import map_npy
 from perception.io.documents import refusing
-from perception.photos.decode import read_picture, scaled_K
-from perception.photos.lens import rescale_lens, warp_grid
+from perception.photos.decode import read_picture, warped
+from perception.photos.lens import rescale_lens, same_aspect
 from perception.photos.views import view_lens
-from perception.types import DepthImage, Lens, View
+from perception.types import View
 
 SATURATED = 65535
 """Value of 16-bit depth images that means "too far to measure"."""
 _EDGE = 0.05
 """Relative step of depth between neighbouring pixels that belong to two surfaces."""
-_ASPECT = 0.02
-"""Largest relative difference between the aspect ratios of a depth image and its photo: sizes are whole pixels."""
 
 
 def read_depth(path: Path) -> np.ndarray:
-    """The image [h, w] as stored, float32; 0 where nothing was measured (0, negative, NaN, infinite, saturated).
+    """The image [h, w] as stored, float32, 0 = nothing `measured`.
     InputError when the file is missing, damaged, empty or not of one channel."""
     if not path.is_file():
         raise InputError(f"{path}: no such depth image")
@@ -33,30 +31,27 @@ def read_depth(path: Path) -> np.ndarray:
         image = map_npy(path) if path.suffix.lower() == ".npy" else read_picture(path, path, what)
     if image.ndim != 2 or image.size == 0 or image.dtype.kind not in "uif":
         raise InputError(f"{path}: found {image.dtype} {list(image.shape)}, expected a depth image of one channel")
+    return measured(image)
+
+
+def measured(image: np.ndarray) -> np.ndarray:
+    """A depth image as float32, 0 where nothing was measured (0, negative, NaN, infinite, saturated)."""
     depth = image.astype(np.float32)
-    none = ~np.isfinite(depth) | (depth <= 0)
-    if image.dtype == np.uint16:
-        none |= image == SATURATED
-    depth[none] = 0
+    depth[~np.isfinite(depth) | (depth < 0) | ((image == SATURATED) & (image.dtype == np.uint16))] = 0
     return depth
 
 
 def load_depth(view: View, width: int, height: int) -> np.ndarray:
     """Depth [height, width] float32 along the optical axis of the view's pinhole, in scene units; 0 = none.
-
-    Each pixel takes the nearest measured pixel on its ray, so that no depth is mixed across an edge. A view without
-    depth has zeros. InputError for a depth image of another aspect ratio than its camera.
-    """
+    A view without depth has zeros. InputError for a depth image of another aspect ratio than its camera."""
     if view.depth is None:
         return np.zeros((height, width), np.float32)
-    image = read_depth(view.depth.path)
-    lens = _depth_lens(view, view.depth, *image.shape[::-1])
-    K = scaled_K(view, width, height)
-    x, y = warp_grid(lens, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), width, height)
-    inside = (x >= 0) & (y >= 0) & (x < image.shape[1]) & (y < image.shape[0])
-    depth = np.zeros((height, width), np.float32)
-    depth[inside] = image[y[inside].astype(np.int64), x[inside].astype(np.int64)] * np.float32(view.depth.scale)
-    return depth
+    image, lens = read_depth(view.depth.path), view.depth.lens or view_lens(view)
+    size = image.shape[::-1]
+    if not same_aspect(size, (lens.width, lens.height)):
+        found = f"the depth image is {size[0]}×{size[1]}, its camera {lens.width}×{lens.height}"
+        raise InputError(f"{view.depth.path}: {found}; expected the same field of view at any resolution")
+    return warped(image, view, rescale_lens(lens, *size), width, height) * np.float32(view.depth.scale)
 
 
 def without_edges(depth: np.ndarray) -> np.ndarray:
@@ -65,11 +60,3 @@ def without_edges(depth: np.ndarray) -> np.ndarray:
     kernel = np.ones((3, 3), np.uint8)
     near = cv2.erode(np.where(depth > 0, depth, np.float32(np.inf)), kernel)
     return np.where(cv2.dilate(depth, kernel) - near <= _EDGE * depth, depth, np.float32(0))
-
-
-def _depth_lens(view: View, depth: DepthImage, width: int, height: int) -> Lens:
-    lens = depth.lens or view_lens(view)
-    if abs(width * lens.height / (height * lens.width) - 1) > _ASPECT:
-        found = f"the depth image is {width}×{height}, its camera {lens.width}×{lens.height}"
-        raise InputError(f"{depth.path}: {found}; expected the same field of view at any resolution")
-    return rescale_lens(lens, width, height)

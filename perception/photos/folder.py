@@ -40,7 +40,7 @@ class PhotoSet:
 
 @dataclass
 class _Look:
-    """Data of one photo: a grey thumbnail [h, w] uint8 of at most 320 pixels, or the error of reading it."""
+    """Data of one photo: a grey thumbnail [h, w] uint8 of at most 320 pixels; why: the reason to leave it out."""
 
     path: Path
     name: str
@@ -48,16 +48,14 @@ class _Look:
     grey: np.ndarray = field(default_factory=lambda: np.zeros((1, 1), np.uint8))
     sharpness: float = 0.0
     stitched: bool = False
-    error: InputError | None = None
+    unreadable: bool = False
     why: str | None = None
 
 
 def list_photos(folder: Path, suffixes: frozenset[str] = SUFFIXES) -> list[Path]:
     """All photos, or files of other suffixes, under `folder`, sorted by their path relative to it.
-
     Skipped: hidden files and folders, maps and work folders (*.gsmap*), frames taken from a video. Linked folders are
-    followed; each real folder is listed once.
-    """
+    followed; each real folder is listed once."""
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of photos")
@@ -73,9 +71,7 @@ def list_photos(folder: Path, suffixes: frozenset[str] = SUFFIXES) -> list[Path]
             inside = list(here.iterdir())
         except OSError:  # a folder without read permission
             continue
-        for path in inside:
-            if path.name.startswith("."):
-                continue
+        for path in (path for path in inside if not path.name.startswith(".")):
             if path.is_dir():
                 if ".gsmap" not in path.name and not (path / FRAMES_RECORD).is_file():
                     waiting.append(path)
@@ -92,8 +88,8 @@ def view_name(photo: Path, folder: Path) -> str:
     name = photo.relative_to(folder).as_posix()
     if name.isprintable() and "\\" not in name:
         return name
-    plain = (c if c.isprintable() and c not in "%\\" else "".join(f"%{b:02X}" for b in os.fsencode(c)) for c in name)
-    return "".join(plain)
+    escaped = {c: "".join(f"%{byte:02X}" for byte in os.fsencode(c)) for c in name if not c.isprintable() or c in "%\\"}
+    return "".join(escaped.get(c, c) for c in name)
 
 
 def choose_photos(folder: Path, strict: bool, progress: Progress) -> PhotoSet:
@@ -104,15 +100,14 @@ def choose_photos(folder: Path, strict: bool, progress: Progress) -> PhotoSet:
     Blurred photos are kept and reported. strict: the first photo that cannot be read is raised as InputError.
     """
     paths = list_photos(folder)
-    looks: list[_Look] = []
-    taken: set[str] = set()
+    named: dict[str, _Look] = {}
     with ThreadPoolExecutor(min(4, cores())) as pool:
         for done, look in enumerate(pool.map(lambda path: _look(path, folder, strict), paths), start=1):
-            while look.name in taken:  # an escaped name that is already in use
+            while look.name in named:  # an escaped name that is already in use
                 look.name += "_"
-            taken.add(look.name)
-            looks.append(look)
+            named[look.name] = look
             progress.update("poses: photos", done, len(paths))
+    looks = list(named.values())
     _leave_out_panoramas([look for look in looks if look.why is None])
     _leave_out_doubles([look for look in looks if look.why is None])
     kept = [look for look in looks if look.why is None]
@@ -136,7 +131,7 @@ def _look(path: Path, folder: Path, strict: bool) -> _Look:
     except InputError as error:
         if strict:
             raise
-        look.error, look.why = error, str(error)
+        look.unreadable, look.why = True, str(error)
         return look
     look.sharpness = float(cv2.Laplacian(look.grey, cv2.CV_64F).var())
     return look
@@ -181,27 +176,21 @@ def _same_picture(a: _Look, b: _Look) -> bool:
 
 
 def _notes(folder: Path, looks: list[_Look], kept: list[_Look]) -> list[str]:
-    notes = []
-    of = f"of {len(looks)} photos"
-    doubles = [look.name for look in looks if look.why is not None and look.why.startswith("a double")]
-    if doubles:
+    notes, of = [], f"of {len(looks)} photos"
+    if doubles := [look.name for look in looks if (look.why or "").startswith("a double")]:
         notes.append(f"{len(doubles)} {of} are doubles (bursts, copies) and left out: {_some(doubles)}")
-    broken = [look for look in looks if look.error is not None]
-    if broken:
+    if broken := [look for look in looks if look.unreadable]:
         names = _some([look.name for look in broken])
-        notes.append(f"warning: {len(broken)} {of} cannot be read and are left out: {names} ({broken[0].error})")
+        notes.append(f"warning: {len(broken)} {of} cannot be read and are left out: {names} ({broken[0].why})")
     usual = float(np.median([look.sharpness for look in kept])) if kept else 0.0
-    blurred = [look.name for look in kept if look.sharpness < BLURRED * usual]
-    if blurred:
+    if blurred := [look.name for look in kept if look.sharpness < BLURRED * usual]:
         notes.append(f"{len(blurred)} {of} are far more blurred than the others, and used: {_some(blurred)}")
-    videos = list_photos(folder, VIDEO_SUFFIXES)
-    if videos:
+    if videos := list_photos(folder, VIDEO_SUFFIXES):
         stems = {look.path.with_suffix("") for look in looks}
         live = sum(video.with_suffix("") in stems for video in videos)
-        notes.append(
-            f"{len(videos)} videos beside the photos are not read, {live} of them belong to Live Photos: "
-            + _some([view_name(video, folder) for video in videos])
-        )
+        names = _some([view_name(video, folder) for video in videos])
+        unread = f"{len(videos)} videos beside the photos are not read"
+        notes.append(f"{unread}, {live} of them belong to Live Photos: {names}")
     return notes
 
 

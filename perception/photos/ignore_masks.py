@@ -12,11 +12,9 @@ import cv2
 import numpy as np
 
 from perception.errors import InputError
-from perception.photos.decode import photo_size, read_picture, warp_labels
+from perception.photos.decode import nearest, photo_size, read_picture, warp_labels
+from perception.photos.lens import same_aspect
 from perception.types import Scene, View
-
-_ASPECT = 0.02
-"""Largest relative difference between the aspect ratios of a mask and its photo: sizes are whole pixels."""
 
 
 def mask_of(folder: Path | None, name: str) -> Path | None:
@@ -29,21 +27,17 @@ def mask_of(folder: Path | None, name: str) -> Path | None:
 
 def read_mask(path: Path, width: int, height: int) -> np.ndarray:
     """[height, width] uint8, 255 = used, 0 = ignored; a mask of another resolution is sampled at the nearest pixel.
-
     Ignored are pixels that are black in all channels, or transparent. InputError for a file that is missing, no image,
-    or of another aspect ratio.
-    """
+    or of another aspect ratio."""
     image = read_picture(path, path, "mask; expected a PNG in which black (0) pixels are ignored")
     channels = image.reshape(*image.shape[:2], -1)
     used: np.ndarray = np.any(channels[..., :3] > 0, axis=2)
     if channels.shape[2] in (2, 4):
         used &= channels[..., -1] > 0
     rows, columns = used.shape
-    if abs(columns * height / (rows * width) - 1) > _ASPECT:
+    if not same_aspect((columns, rows), (width, height)):
         raise InputError(f"{path}: the mask is {columns}×{rows}, its photo {width}×{height}; expected the same shape")
-    down = ((np.arange(height) + 0.5) * rows / height).astype(np.int64)
-    right = ((np.arange(width) + 0.5) * columns / width).astype(np.int64)
-    return used[down[:, None], right[None, :]].astype(np.uint8) * 255
+    return nearest(used, width, height).astype(np.uint8) * 255
 
 
 def load_weight(view: View, width: int, height: int) -> np.ndarray | None:
@@ -64,10 +58,8 @@ def stage_masks(folder: Path, photos: list[Path], names: list[str], masks: list[
 
 def with_checked_masks(scene: Scene, folder: Path | None) -> Scene:
     """The scene without the photos that their masks ignore completely, and a note on what is ignored.
-
     folder: of masks, as the user named it. InputError when it holds none for these photos, a mask is unreadable, or
-    nothing is left.
-    """
+    nothing is left."""
     masked = [view for view in scene.views if view.mask is not None]
     if folder is not None and not masked:
         raise InputError(
@@ -77,14 +69,13 @@ def with_checked_masks(scene: Scene, folder: Path | None) -> Scene:
     if not masked:
         return scene
     weights = ((view.name, load_weight(view, view.width, view.height)) for view in masked)
-    shares = {name: 0.0 if weight is None else 1.0 - float(weight.mean()) for name, weight in weights}
-    views = [view for view in scene.views if shares.get(view.name) != 1.0]
+    ignored = {name: 1.0 - float(weight.mean()) for name, weight in weights if weight is not None}
+    views = [view for view in scene.views if ignored.get(view.name) != 1.0]
     if not views:
         raise InputError(f"{masked[0].mask}: this and all other masks are black (0 = ignored); are they inverted?")
-    black = [view for view in masked if shares[view.name] == 1.0]
+    black = [view for view in masked if ignored[view.name] == 1.0]
     out = [{"name": view.name, "why": f"{view.mask}: ignores every pixel"} for view in black]
-    share = float(np.mean(list(shares.values())))
+    share = float(np.mean(list(ignored.values())))
     note = f"masks: {share:.1%} of the pixels of {len(masked)} of {len(scene.views)} photos are ignored"
-    report = {**scene.report, "notes": [*scene.report.get("notes", []), note]}
-    report["left_out"] = [*report.get("left_out", []), *out]
-    return replace(scene, views=views, report=report)
+    facts = {"notes": [*scene.report.get("notes", []), note], "left_out": [*scene.report.get("left_out", []), *out]}
+    return replace(scene, views=views, report={**scene.report, **facts})

@@ -15,6 +15,8 @@ from perception.errors import InputError
 from perception.types import Lens
 
 MIN_FOCAL, MOST_PIXELS, MOST_SIDE = 1e-2, 1e9, 1 << 20
+_ASPECT = 0.02
+"""Largest relative difference between aspect ratios that count as the same: sizes are whole pixels."""
 _PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 PERSPECTIVE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 FISHEYE = ("k1", "k2", "k3", "k4")
@@ -83,38 +85,30 @@ def rescale_lens(lens: Lens, width: int, height: int) -> Lens:
 @lru_cache(maxsize=256)
 def pinhole_from_lens(lens: Lens) -> tuple[tuple[float, float, float, float], int, int]:
     """(fx, fy, cx, cy), width, height of the pinhole image that `lens` undistorts to.
-
     As COLMAP's default: focal lengths are kept, the size is chosen so that no pixel is blank (0.2 to 2 times that of
-    the photo). Values of a lens without distortion are returned unchanged. InputError where undistortion fails.
-    """
-    camera = camera_from_lens(lens)
-    if is_pinhole(lens):
-        focal = (camera.focal_length_x, camera.focal_length_y)
-        center = (camera.principal_point_x, camera.principal_point_y)
-        _check_pinhole(lens, (*focal, *center), lens.width, lens.height)
-        return (*focal, *center), lens.width, lens.height
-    pycolmap = load_pycolmap()
+    the photo). Values of a lens without distortion are returned unchanged. InputError where undistortion fails."""
+    ideal, plain, pycolmap = camera_from_lens(lens), is_pinhole(lens), load_pycolmap()
     try:
-        ideal = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+        ideal = ideal if plain else pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), ideal)
     except (ValueError, RuntimeError) as error:
         raise InputError(f"camera model {lens.model} cannot be undistorted to a pinhole") from error
-    fx, fy, cx, cy = (float(x) for x in ideal.params)
-    if min(ideal.width, ideal.height) < 2:
-        raise InputError(f"camera {lens.model} {list(lens.params)} cannot be undistorted to a pinhole")
-    _check_pinhole(lens, (fx, fy, cx, cy), ideal.width, ideal.height)
-    return (fx, fy, cx, cy), int(ideal.width), int(ideal.height)
-
-
-def _check_pinhole(lens: Lens, values: tuple[float, float, float, float], width: int, height: int) -> None:
-    """InputError for values outside the range of real cameras, where float32 cannot resolve the rays of pixels."""
-    *focal, cx, cy = values
-    if not (min(focal) >= MIN_FOCAL and max(focal) <= MOST_PIXELS and max(abs(cx), abs(cy)) <= MOST_PIXELS):
+    fx, fy = float(ideal.focal_length_x), float(ideal.focal_length_y)
+    cx, cy = float(ideal.principal_point_x), float(ideal.principal_point_y)
+    # Beyond the range of real cameras, float32 cannot resolve the rays of pixels.
+    if not (min(fx, fy) >= MIN_FOCAL and max(fx, fy) <= MOST_PIXELS and max(abs(cx), abs(cy)) <= MOST_PIXELS):
         raise InputError(
-            f"camera {lens.model} {list(lens.params)}: seen as a pinhole of focal lengths {focal[0]:g}, {focal[1]:g} "
+            f"camera {lens.model} {list(lens.params)}: seen as a pinhole of focal lengths {fx:g}, {fy:g} "
             f"and centre {cx:g}, {cy:g}; expected {MIN_FOCAL:g} to {MOST_PIXELS:g} and at most {MOST_PIXELS:g} pixels"
         )
-    if min(width, height) < 1 or max(width, height) > MOST_SIDE:
+    width, height = int(ideal.width), int(ideal.height)
+    if min(width, height) < (1 if plain else 2) or max(width, height) > MOST_SIDE:
         raise InputError(f"camera {lens.model}: {width}×{height} pixels, expected sides of 1 to {MOST_SIDE}")
+    return (fx, fy, cx, cy), width, height
+
+
+def same_aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:
+    """Whether two sizes (width, height) are of one aspect ratio, as those of a photo and of its depth or its mask."""
+    return abs(a[0] * b[1] / (a[1] * b[0]) - 1) <= _ASPECT
 
 
 def is_pinhole(lens: Lens) -> bool:

@@ -26,10 +26,8 @@ _UNREADABLE = "not a readable video; expected .mp4, .mov or another that OpenCV'
 @dataclass
 class Chooser:
     """Selects keyframes: pass all frames in order to `show`, then call `chosen`.
-
     spacing: motion between kept frames as a share of the image width (median motion of tracked corners, summed over
-    frames). A segment is left out if its sharpest frame is below SHARP_SHARE of the median sharpness.
-    """
+    frames). A segment is left out if its sharpest frame is below SHARP_SHARE of the median sharpness."""
 
     spacing: float = 0.08
     motion: list[float] = field(default_factory=list)
@@ -56,26 +54,22 @@ class Chooser:
         stretch = np.floor(way / spacing + 1e-9).astype(int)
         sharpness = np.array(self.sharpness)
         least = SHARP_SHARE * float(np.median(sharpness))
-        kept = []
-        for number in np.unique(stretch):
-            rows = np.flatnonzero(stretch == number)
-            best = int(rows[sharpness[rows].argmax()])
-            if sharpness[best] >= least:
-                kept.append(best)
-        return kept[:most]
+        order = np.lexsort((-sharpness, stretch))  # the sharpest first in each stretch
+        best = order[np.unique(stretch[order], return_index=True)[1]]
+        return [int(number) for number in best[sharpness[best] >= least][:most]]
 
 
 def motion_between(before: np.ndarray, after: np.ndarray) -> float:
     """Median motion of tracked corners as a share of the image width; 1 if tracking fails."""
+    if before.shape != after.shape:
+        return 1.0
     corners = cv2.goodFeaturesToTrack(before, 200, 0.01, 6)
-    if corners is None or len(corners) < _MIN_TRACKS or before.shape != after.shape:
-        same = before.shape == after.shape and abs(float(before.mean()) - float(after.mean())) < 8
-        return 0.0 if same else 1.0  # too little texture to track; equal brightness counts as no motion
+    if corners is None or len(corners) < _MIN_TRACKS:  # too little texture; equal brightness counts as no motion
+        return float(abs(float(before.mean()) - float(after.mean())) >= 8)
     there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None)  # type: ignore[call-overload]
     good = found.ravel() == 1
-    if good.sum() < _MIN_TRACKS:
-        return 1.0
-    return float(np.median(np.linalg.norm((there - corners).reshape(-1, 2)[good], axis=1))) / before.shape[1]
+    moved = np.linalg.norm((there - corners).reshape(-1, 2)[good], axis=1)
+    return float(np.median(moved)) / before.shape[1] if len(moved) >= _MIN_TRACKS else 1.0
 
 
 FRAMES_RECORD = "frames.json"

@@ -65,16 +65,10 @@ class StoredView(View):
 
 def stored_view(view: View, folder: Path, held_out: bool = False) -> StoredView:
     """`view` with the record of its photo for the map at `folder`: both paths, and the size (None if missing)."""
-    photo = absolute(view.photo)  # links are kept: they are how the user names his photos
-    try:
-        size = photo.stat().st_size if photo.is_file() else None
-    except OSError:
-        size = None
+    photo = absolute(view.photo)  # links are kept: the user names his photos by them
     K, pose = np.asarray(view.K, np.float64), np.asarray(view.camera_from_world, np.float64)
-    beside = _relative(photo, folder)
-    return StoredView(
-        view.name, photo, K, view.width, view.height, pose, view.lens, held_out, None, None, view.gain, beside, size
-    )
+    own = (view.name, photo, K, view.width, view.height, pose, view.lens, held_out, None, None, view.gain)
+    return StoredView(*own, _relative(photo, folder), _bytes(photo))
 
 
 def moved_record(view: StoredView, before: Path, after: Path) -> StoredView:
@@ -87,22 +81,24 @@ def moved_record(view: StoredView, before: Path, after: Path) -> StoredView:
 def locate_photo(view: View, folder: Path | None) -> Path:
     """The path of the photo of `view`: relative to the map, else its absolute path when the map was made.
     folder: of the map, None when it is not on disk. InputError when there is no file, or only one of another size."""
-    paths = [Path(view.photo)]
-    size = None
-    if isinstance(view, StoredView):
-        size = view.photo_bytes
-        if folder is not None and view.photo_beside is not None:
-            paths.insert(0, absolute(pointed(folder) / view.photo_beside))
-    other = None
-    for path in paths:
-        try:
-            found = path.stat().st_size if path.is_file() else None
-        except OSError:
-            found = None
-        if found is not None and size in (None, found):
+    paths, size = [Path(view.photo)], view.photo_bytes if isinstance(view, StoredView) else None
+    if isinstance(view, StoredView) and folder is not None and view.photo_beside is not None:
+        paths.insert(0, absolute(pointed(folder) / view.photo_beside))
+    sizes = {path: found for path in paths if (found := _bytes(path)) is not None}
+    for path, found in sizes.items():
+        if size in (None, found):
             return path
-        other = other or (found is not None and f"{path}: has {found} bytes, the photo of the map had {size}") or None
-    raise InputError(f"{other or f'{paths[0]}: the photo is missing'}; tell where the photos are: perception relink")
+    others = [f"{path}: has {found} bytes, the photo of the map had {size}" for path, found in sizes.items()]
+    wrong = (others or [f"{paths[0]}: the photo is missing"])[0]
+    raise InputError(f"{wrong}; give the folder of the photos: perception relink")
+
+
+def _bytes(path: Path) -> int | None:
+    """The size of a file; None where there is none that can be reached."""
+    try:
+        return path.stat().st_size if path.is_file() else None
+    except OSError:
+        return None
 
 
 def absolute(path: Path) -> Path:

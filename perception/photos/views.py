@@ -41,10 +41,10 @@ def rigid_pose(matrix: np.ndarray, what: str) -> np.ndarray:
 def fit_lens(lens: Lens, photo: Path, source: Path) -> tuple[Lens, str | None]:
     """The lens scaled to the photo's size, and a note if it was scaled; InputError if the aspect ratio differs.
     For a large photo that is read at 1/2, 1/4 or 1/8, the lens of the full size is scaled in the same way."""
-    size, whole = photo_size(photo), (lens.width, lens.height)
-    if whole in (size, stored_size(photo)) and max(whole) <= max(size):
+    size, full = photo_size(photo), (lens.width, lens.height)
+    if full in (size, stored_size(photo)) and max(full) <= max(size):
         return lens, None
-    if size[0] * lens.height == size[1] * lens.width or size in (reduced_size(*whole, k) for k in (2, 4, 8)):
+    if size[0] * lens.height == size[1] * lens.width or size in (reduced_size(*full, k) for k in (2, 4, 8)):
         note = f"{photo.name}: photo {size[0]}×{size[1]}, camera {lens.width}×{lens.height}: intrinsics scaled"
         return rescale_lens(lens, *size), note
     found = f"{photo.name} is {size[0]}×{size[1]} but its camera says {lens.width}×{lens.height}"

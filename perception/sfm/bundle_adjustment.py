@@ -77,46 +77,41 @@ def residuals(tracks: Tracks, poses: Poses, points: np.ndarray) -> tuple[np.ndar
 
 def adjust(tracks: Tracks, given: Poses, poses: Poses, prior: tuple[float, float]) -> Poses:
     """`poses` adjusted, together with the points of the tracks. given: the poses that the priors pull to.
-
     prior: standard errors of a given pose relative to that of the next view: angle in radians, centre in scene units.
-    The priors keep the world frame, and hold views that have no features.
-    """
-    points = starting_points(tracks, poses)
+    The priors keep the world frame, and hold views that have no features."""
+    points, priors = starting_points(tracks, poses), _priors(len(given.center), prior)
     for _ in range(ROUNDS):
         error, depth, _ = residuals(tracks, poses, points)
         known = np.abs(depth[tracks.depth > 0])
         # Standard errors from the medians of normal residuals in 2D (1.18 σ) and 1D (0.67 σ).
         sigma = max(float(np.median(np.hypot(*error.T))) / 1.1774, LEAST_PIXELS)
         depth_sigma = max(float(np.median(known)) / 0.6745 if len(known) else 0.0, LEAST_DEPTH)
-        problem = _Problem(tracks, given, prior, sigma, depth_sigma)
-        poses, points = _round(problem, poses, points)
+        problem = _Problem(tracks, given, *priors, sigma, depth_sigma)
+        damping, cost = 1e-4, _cost(problem, poses, points)
+        for _ in range(STEPS):
+            delta, shift = _step(problem, poses, points, damping)
+            moved, shifted = poses.turned(delta), points + shift
+            now = _cost(problem, moved, shifted)
+            if not now < cost:
+                damping *= 10
+                continue
+            poses, points, damping, gain, cost = moved, shifted, max(damping / 10, 1e-9), 1 - now / cost, now
+            if gain < GAIN:
+                break
     return poses
 
 
 @dataclass(frozen=True)
 class _Problem:
-    """sigma: standard error of features in pixels; depth_sigma: relative, of measured depth."""
+    """prior_rows, prior_weights: see `_priors`. sigma: standard error of features in pixels; depth_sigma: of measured
+    depth relative to it."""
 
     tracks: Tracks
     given: Poses
-    prior: tuple[float, float]
+    prior_rows: Any
+    prior_weights: np.ndarray
     sigma: float
     depth_sigma: float
-
-
-def _round(problem: _Problem, poses: Poses, points: np.ndarray) -> tuple[Poses, np.ndarray]:
-    damping, cost = 1e-4, _cost(problem, poses, points)
-    for _ in range(STEPS):
-        delta, shift = _step(problem, poses, points, damping)
-        moved, shifted = poses.turned(delta), points + shift
-        now = _cost(problem, moved, shifted)
-        if not now < cost:
-            damping *= 10
-            continue
-        poses, points, damping, gain, cost = moved, shifted, max(damping / 10, 1e-9), 1 - now / cost, now
-        if gain < GAIN:
-            break
-    return poses, points
 
 
 def _normalised(problem: _Problem, poses: Poses, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -129,20 +124,24 @@ def _cost(problem: _Problem, poses: Poses, points: np.ndarray) -> float:
     """Σ s² log(1 + |r|²/s²) of pixels and of depths + Σ |priors|²."""
     error, depth, _ = _normalised(problem, poses, points)
     robust = CAUCHY**2 * (np.log1p((error**2).sum(1) / CAUCHY**2).sum() + np.log1p(depth**2 / CAUCHY**2).sum())
-    rows, weight = _priors(poses.since(problem.given), problem.prior)
-    return float(robust + (weight * rows**2).sum())
+    deviations = problem.prior_rows @ poses.since(problem.given).ravel()
+    return float(robust + (problem.prior_weights * deviations**2).sum())
 
 
-def _priors(delta: np.ndarray, prior: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Rows [2N − 1, 6]: deviations from the given poses and their differences between views; their weights."""
+def _priors(count: int, prior: tuple[float, float]) -> tuple[Any, np.ndarray]:
+    """A sparse [6 (2N − 1), 6N]: times the deviations of N poses from the given ones, it is these deviations and their
+    differences between consecutive views; the weights of its rows."""
+    from scipy.sparse import diags, identity, kron, vstack
+
+    steps = diags([-np.ones(max(count - 1, 1)), np.ones(max(count - 1, 1))], [0, 1], shape=(count - 1, count))
     inverse = np.repeat(1 / np.square(prior), 3)
-    rows = np.concatenate([delta, np.diff(delta, axis=0)])
-    return rows, np.where(np.arange(len(rows))[:, None] < len(delta), inverse / LOOSE**2, inverse)
+    weights = np.concatenate([np.tile(inverse / LOOSE**2, count), np.tile(inverse, count - 1)])
+    return kron(vstack([identity(count), steps]), identity(6)).tocsr(), weights
 
 
 def _step(problem: _Problem, poses: Poses, points: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
     """One damped step: delta [N, 6] of the poses, shift [P, 3] of the points."""
-    from scipy.sparse import bsr_matrix
+    from scipy.sparse import bsr_matrix, diags
 
     tracks, count, size = problem.tracks, len(poses.center), problem.tracks.size
     residual, J_pose, J_point = _linearised(problem, poses, points)
@@ -158,9 +157,10 @@ def _step(problem: _Problem, poses: Poses, points: np.ndarray, damping: float) -
         (np.einsum("orv,orw->ovw", J_pose, J_point)[order], tracks.point[order], starts), shape=(6 * count, 3 * size)
     )
     eliminate = W @ bsr_matrix((V_inverse, np.arange(size), np.arange(size + 1)), shape=(3 * size, 3 * size))
-    prior_H, prior_g = _prior_system(poses.since(problem.given), problem.prior)
+    A, weight = problem.prior_rows, problem.prior_weights
+    prior_g = -(A.T @ (weight * (A @ poses.since(problem.given).ravel())))
     U = bsr_matrix((U, np.arange(count), np.arange(count + 1)), shape=(6 * count, 6 * count))
-    reduced = (U + prior_H - eliminate @ W.T).tocsr()
+    reduced = (U + A.T @ diags(weight) @ A - eliminate @ W.T).tocsr()
     reduced.setdiag(reduced.diagonal() * (1 + damping))
     delta = _solved(reduced, g_pose.ravel() + prior_g - eliminate @ g_point.ravel())
     shift = np.einsum("pij,pj->pi", V_inverse, g_point - (W.T @ delta).reshape(size, 3))
@@ -187,17 +187,6 @@ def _linearised(problem: _Problem, poses: Poses, points: np.ndarray) -> tuple[np
     J_pose = np.concatenate([np.cross(J_point, arm[:, None]), -J_point], axis=2)
     residual = np.concatenate([np.where(front[:, None], error, 0.0), depth[:, None]], axis=1)
     return root * residual, J_pose, J_point
-
-
-def _prior_system(delta: np.ndarray, prior: tuple[float, float]) -> tuple[Any, np.ndarray]:
-    """Matrix [6N, 6N] and right side [6N] of the normal equations of the priors."""
-    from scipy.sparse import diags, identity, kron, vstack
-
-    count = len(delta)
-    rows, weight = _priors(delta, prior)
-    steps = diags([-np.ones(max(count - 1, 1)), np.ones(max(count - 1, 1))], [0, 1], shape=(count - 1, count))
-    A = kron(vstack([identity(count), steps]), identity(6)).tocsr()
-    return A.T @ diags(weight.ravel()) @ A, -(A.T @ (weight * rows).ravel())
 
 
 def _solved(A: Any, b: np.ndarray) -> np.ndarray:

@@ -6,11 +6,13 @@ verified pair satisfy one epipolar geometry, which the model either agrees with 
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from networkx.utils import UnionFind
 from scipy.spatial import cKDTree
 
 from perception.sfm.database import verified_matches
@@ -55,32 +57,20 @@ def model_warnings(models: list[Any], database: Path, photos: int) -> list[str]:
         warnings.append(f"{wrong} and are stronger than the pairs it rests on: it may be folded (equal textures?)")
     unmatched, near = _unmatched_neighbors(best, {(pair.i, pair.j) for pair in pairs})
     if near >= 5 and unmatched > MAX_UNMATCHED * near:
-        warnings.append(
-            f"{unmatched} of {near} photo pairs that the model puts at one position, looking the same way, do not match"
-            ": it may be folded (equal textures?)"
-        )
+        alike = f"{unmatched} of {near} photo pairs that the model puts at one position, looking the same way"
+        warnings.append(f"{alike}, do not match: it may be folded (equal textures?)")
     return warnings
 
 
 def stronger_contradictions(pairs: list[Pair]) -> list[Pair]:
     """The contradicted pairs whose photos are not connected by agreeing pairs that are all at least as strong.
-
     Repeated textures also give verified pairs, so a contradicted pair alone is not an error. It is one if the model
-    depends on weaker pairs instead.
-    """
-    parent: dict[int, int] = {}
-
-    def root(image: int) -> int:
-        while parent.setdefault(image, image) != image:
-            parent[image] = parent[parent[image]]
-            image = parent[image]
-        return image
-
-    found = []
+    depends on weaker pairs instead."""
+    connected, found = UnionFind(), []
     for pair in sorted(pairs, key=lambda p: (-p.inliers, not p.agrees)):
         if pair.agrees:
-            parent[root(pair.i)] = root(pair.j)
-        elif root(pair.i) != root(pair.j):
+            connected.union(pair.i, pair.j)
+        elif connected[pair.i] != connected[pair.j]:
             found.append(pair)
     return found
 
@@ -92,25 +82,24 @@ def is_contradicted(pairs: list[Pair]) -> bool:
 
 def outvoted_photos(pairs: list[Pair]) -> set[int]:
     """Photos most of whose verified matches lie in pairs that contradict the model."""
-    votes: dict[int, int] = {}
+    votes = Counter[int]()
     for pair in pairs:
-        for image in (pair.i, pair.j):
-            votes[image] = votes.get(image, 0) + (pair.inliers if pair.agrees else -pair.inliers)
+        votes.update(dict.fromkeys((pair.i, pair.j), pair.inliers if pair.agrees else -pair.inliers))
     return {image for image, vote in votes.items() if vote < 0}
 
 
 def verified_pairs(model: Any, database: Path) -> list[Pair]:
     """The verified pairs between registered photos, judged by the model."""
-    registered = set(model.reg_image_ids())
-    poses = {i: model.images[i].cam_from_world().matrix() for i in registered}
-    rays: dict[int, np.ndarray] = {i: _normalised(model.images[i]) for i in registered}
-    focal = {i: model.images[i].camera.mean_focal_length() for i in registered}
-    tolerance = {i: max(EPIPOLAR_TOLERANCE, TOLERANCE_PIXELS / focal[i]) for i in registered}
+    registered = {i: model.images[i] for i in model.reg_image_ids()}
+    poses = {i: image.cam_from_world().matrix() for i, image in registered.items()}
+    rays = {i: _normalised(image) for i, image in registered.items()}
     pairs = []
     for (i, j), found in verified_matches(database).items():
         if i in registered and j in registered and len(found):
             distance = _sampson(rays[i][found[:, 0]], rays[j][found[:, 1]], poses[i], poses[j])
-            pairs.append(Pair(i, j, len(found), float((distance < max(tolerance[i], tolerance[j])).mean())))
+            focal = min(registered[image].camera.mean_focal_length() for image in (i, j))
+            agree = distance < max(EPIPOLAR_TOLERANCE, TOLERANCE_PIXELS / focal)
+            pairs.append(Pair(i, j, len(found), float(agree.mean())))
     return pairs
 
 

@@ -6,6 +6,7 @@ import hashlib
 import json
 import shutil
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +25,15 @@ POSED_PARTNERS = 12
 """With given poses no model has to be found: each photo is matched with this many photos at most, the best pairs."""
 
 
+@dataclass(frozen=True)
 class FeatureStore:
-    """A folder with the COLMAP `database.db` and `photos/`, which holds the photos under numbered names (see staging).
-    names[i] is the name of the i-th photo in both."""
+    """A folder with the COLMAP `database.db`. image_root: of the photos under numbered names (see staging).
+    names[i] is the name of the i-th photo in both. facts: numbers of pairs, seconds."""
 
-    def __init__(self, folder: Path, names: list[str], facts: dict[str, Any], photos: Path | None = None) -> None:
-        self.folder, self.image_root, self.names, self.facts = folder, photos or folder / "photos", names, facts
+    folder: Path
+    image_root: Path
+    names: list[str]
+    facts: dict[str, Any]
 
     @property
     def database(self) -> Path:
@@ -58,13 +62,12 @@ def build_features(
     size, EXIF camera and known lens agree. masks: of pixels without features, per photo (see `ignore_masks`).
     posed: the poses are known, so fewer pairs are matched (POSED_PARTNERS).
     """
-    seed, progress = options.seed, options.progress
+    seed, progress, local = options.seed, options.progress, options.engine.kind == "local"
     masks = masks if masks and any(masks) else None
     most = POSED_PARTNERS if posed else len(photos)
     key = _key(photos, lenses, (seed, most), masks)
-    folder, tasks = options.workdir / f"features-{key}", None
-    if options.engine.kind != "local":
-        tasks = FeatureTasks(options.workdir / f"feature-tasks-{key}", options.engine, progress)
+    folder = options.workdir / f"features-{key}"
+    tasks = FeatureTasks(options.workdir / f"feature-tasks-{key}", options.engine, progress)
     recover(folder)
     if not (folder / "facts.json").exists():
         with atomic_directory(folder) as new:
@@ -75,13 +78,13 @@ def build_features(
                 stage_masks(new / "masks", photos, names, masks)
             database = new / "database.db"
             groups = features.import_photos(database, new / "photos", photos, names, lenses)
-            if tasks is None:
+            if local:
                 features.extract(database, new / "photos", groups, progress)
             else:
                 tasks.extract(database, photos, masks)
             extracted = time.perf_counter()
             chosen = [(names[i], names[j]) for i, j in pairs.select_pairs(database, names, most, progress)]
-            if tasks is None:
+            if local:
                 features.match(database, chosen, seed, progress)
             else:
                 tasks.match(database, chosen, seed)
@@ -89,10 +92,9 @@ def build_features(
             possible = len(names) * (len(names) - 1) // 2
             made = {"names": names, "pairs_matched": len(chosen), "pairs_possible": possible, "seconds": seconds}
             (new / "facts.json").write_text(json.dumps(made))
-    if tasks is not None:
-        shutil.rmtree(tasks.folder, ignore_errors=True)
+    shutil.rmtree(tasks.folder, ignore_errors=True)
     facts = json.loads((folder / "facts.json").read_text())
-    return FeatureStore(folder, facts.pop("names"), facts)
+    return FeatureStore(folder, folder / "photos", facts.pop("names"), facts)
 
 
 def _key(
@@ -100,9 +102,5 @@ def _key(
 ) -> str:
     paths = [*photos, *(mask for mask in masks or () if mask is not None)]
     files = [(str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns) for path in paths]
-    extraction = (features.MAX_IMAGE_SIDE, features.MAX_FEATURES, features.MIN_FEATURES, features.PEAK_THRESHOLD)
-    constants: list[float] = [pairs.EXHAUSTIVE_BELOW, pairs.NEIGHBORS, pairs.COARSE_FEATURES, pairs.COARSE_MIN_MATCHES]
-    constants += [pairs.COARSE_RATIO, pairs.PARTNERS, features.MIN_INLIERS]
-    if len(photos) > pairs.RETRIEVED_ABOVE:
-        constants += [pairs.RETRIEVED_ABOVE, pairs.RETRIEVED, pairs.WORDS]
-    return hashlib.sha256(repr((files, lenses, extraction, constants, search)).encode()).hexdigest()[:12]
+    constants = [{name: of for name, of in vars(module).items() if name.isupper()} for module in (features, pairs)]
+    return hashlib.sha256(repr((files, lenses, constants, search)).encode()).hexdigest()[:12]

@@ -25,8 +25,6 @@ VARIES, REMAINS = 0.03, 0.7
 """Gains are used if the standard deviation of their logarithms is above VARIES, and if they leave at most the share
 REMAINS of the differences between colours of the same point. Read: 0.2 and 0.45 in an RGB-D camera's walk, where gains
 are worth 0.8 dB; 0.1 and 0.8 with a phone that also maps tones locally, 0.1 dB; 0.005 and 0.99 with fixed exposure."""
-
-
 LEAST = 30
 """Observations of points that another photo sees as well, for gains to be judged."""
 
@@ -53,10 +51,8 @@ def _difference(logs: np.ndarray, usable: np.ndarray, tracks: Tracks) -> float:
 
 def photo_gains(logs: np.ndarray, usable: np.ndarray, tracks: Tracks, count: int) -> np.ndarray:
     """Logarithms of gains [count, 3], zero in the mean, that explain the logarithms of colours [O, 3] of the tracks.
-
     Minimises Σ ρ(|log c − a_point − g_photo|) by reweighted least squares; the a are eliminated. ρ is the Huber loss,
-    which is convex, and in the second half of the rounds the Cauchy loss. usable: [O] mask of observations.
-    """
+    which is convex, and in the second half of the rounds the Cauchy loss. usable: [O] mask of observations."""
     from scipy.sparse import csr_matrix, diags
     from scipy.sparse.linalg import spsolve
 

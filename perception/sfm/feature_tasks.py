@@ -8,7 +8,9 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from perception.io.atomic import atomic_directory
 from perception.photos.ignore_masks import stage_masks
@@ -28,11 +30,13 @@ _PAIR = 2147483647
 """COLMAP's id of a pair is _PAIR × the smaller image id + the larger."""
 
 
+@dataclass(frozen=True)
 class FeatureTasks:
     """Runs the tasks of one set of photos. folder: of the tasks, which every worker reaches under the same path."""
 
-    def __init__(self, folder: Path, engine: Engine, progress: Progress) -> None:
-        self.folder, self.engine, self.progress = folder, engine, progress
+    folder: Path
+    engine: Engine
+    progress: Progress
 
     def extract(self, database: Path, photos: Sequence[Path], masks: Sequence[Path | None] | None) -> None:
         """Fills the database of imported photos with their features."""
@@ -46,15 +50,13 @@ class FeatureTasks:
                 write_task(folders[-1], photos=paths, masks=covered)
         results = run_tasks(self.engine, extract_task, folders, "feature set", self.progress)
         with closing(sqlite3.connect(database)) as own, own:
-            ids = _ids_by_name(own)
+            ids = iter(_images(own).values())
             for result in results:
                 with closing(sqlite3.connect(result / DATABASE)) as theirs:
-                    theirs_ids = _ids_by_name(theirs)
-                    mine = dict(zip(theirs_ids, ids[: len(theirs_ids)], strict=True))
-                    del ids[: len(theirs_ids)]
+                    own_id = {image: next(ids) for image in _images(theirs).values()}
                     for table in _FEATURES:
                         for image, *row in theirs.execute(f"SELECT * FROM {table}"):
-                            own.execute(_insert(table, 1 + len(row)), (mine[image], *row))
+                            _insert(own, table, (own_id[image], *row))
 
     def match(self, database: Path, chosen: Sequence[tuple[str, str]], seed: int) -> None:
         """Adds the matches of the chosen pairs to a database with features."""
@@ -64,7 +66,9 @@ class FeatureTasks:
             folders.append(self.folder / f"pairs-{first}")
             if not has_task(folders[-1]):
                 folders[-1].mkdir(parents=True, exist_ok=True)
-                write_part(database, _ids(database, {name for pair in some for name in pair}), folders[-1] / DATABASE)
+                with closing(sqlite3.connect(database)) as tables:
+                    ids = _images(tables)
+                write_part(database, [ids[name] for pair in some for name in pair], folders[-1] / DATABASE)
                 write_task(folders[-1], pairs=some, seed=seed)
         results = run_tasks(self.engine, match_task, folders, "pair set", self.progress)
         with closing(sqlite3.connect(database)) as own, own:
@@ -72,7 +76,7 @@ class FeatureTasks:
                 with closing(sqlite3.connect(result / DATABASE)) as theirs:
                     for table in _MATCHES:
                         for row in theirs.execute(f"SELECT * FROM {table}"):
-                            own.execute(_insert(table, len(row)), row)
+                            _insert(own, table, row)
 
 
 def extract_task(task: str, progress: Progress = QUIET) -> None:
@@ -97,22 +101,16 @@ def match_task(task: str, progress: Progress = QUIET) -> None:
     with atomic_directory(folder / RESULT) as new:
         with closing(sqlite3.connect(folder / DATABASE)) as given, closing(sqlite3.connect(new / DATABASE)) as copy:
             given.backup(copy)
-        chosen = [(one, other) for one, other in facts["pairs"]]
-        match(new / DATABASE, chosen, facts["seed"], progress)
+        match(new / DATABASE, facts["pairs"], facts["seed"], progress)
 
 
-def _ids_by_name(database: sqlite3.Connection) -> list[int]:
-    """Ids of the images in the order of their names, which are numbers of photos."""
-    return [image for (image,) in database.execute("SELECT image_id FROM images ORDER BY name")]
+def _images(database: sqlite3.Connection) -> dict[str, int]:
+    """Ids of the images by name, in the order of their names, which are numbers of photos."""
+    return dict(database.execute("SELECT name, image_id FROM images ORDER BY name"))
 
 
-def _insert(table: str, columns: int) -> str:
-    return f"INSERT INTO {table} VALUES ({', '.join('?' * columns)})"
-
-
-def _ids(database: Path, names: set[str]) -> list[int]:
-    with closing(sqlite3.connect(database)) as tables:
-        return [image for image, name in tables.execute("SELECT image_id, name FROM images") if name in names]
+def _insert(database: sqlite3.Connection, table: str, row: Sequence[Any]) -> None:
+    database.execute(f"INSERT INTO {table} VALUES ({', '.join('?' * len(row))})", row)
 
 
 def write_part(
@@ -123,13 +121,13 @@ def write_part(
     target.unlink(missing_ok=True)
     load_pycolmap().Database.open(target).close()  # creates its tables
     with closing(sqlite3.connect(target)) as part, part:
-        part.execute("ATTACH DATABASE ? AS whole", (str(database),))
+        part.execute("ATTACH DATABASE ? AS source", (str(database),))
         for table in _IMAGES:
-            part.execute(f"INSERT INTO {table} SELECT * FROM whole.{table}")
+            part.execute(f"INSERT INTO {table} SELECT * FROM source.{table}")
         part.execute("CREATE TEMP TABLE wanted (id INTEGER PRIMARY KEY)")
-        part.executemany("INSERT INTO wanted VALUES (?)", [(image,) for image in images])
+        part.executemany("INSERT INTO wanted VALUES (?)", [(image,) for image in sorted(set(images))])
         for table in tables:
-            part.execute(f"INSERT INTO {table} SELECT * FROM whole.{table} WHERE image_id IN wanted")
+            part.execute(f"INSERT INTO {table} SELECT * FROM source.{table} WHERE image_id IN wanted")
         if matched:
             both = " AND ".join(f"{image} IN wanted" for image in (f"pair_id / {_PAIR}", f"pair_id % {_PAIR}"))
-            part.execute(f"INSERT INTO two_view_geometries SELECT * FROM whole.two_view_geometries WHERE {both}")
+            part.execute(f"INSERT INTO two_view_geometries SELECT * FROM source.two_view_geometries WHERE {both}")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from perception.photos.decode import exif_folder, exif_of, open_photo, photo_size
+from perception.photos.decode import CAMERA_FOLDER, exif_of, open_photo, photo_size
 from perception.photos.lens import load_pycolmap
 from perception.progress import Progress
 from perception.types import Lens
@@ -84,12 +85,11 @@ def _drop_poor(database: Path, names: list[str]) -> list[str]:
 def _camera_key(photo: Path) -> tuple[Any, ...]:
     """Key of photos that share one camera: size, and EXIF maker, model, focal length and zoom."""
     with open_photo(photo) as image:
-        exif = exif_of(image, photo)
-        details = exif_folder(image, photo, 0x8769)
+        exif, details = exif_of(image, photo), exif_of(image, photo, CAMERA_FOLDER)
     return (*photo_size(photo), exif.get(0x010F), exif.get(0x0110), details.get(0x920A), details.get(0xA404))
 
 
-def match(database: Path, chosen: list[tuple[str, str]], seed: int, progress: Progress) -> None:
+def match(database: Path, chosen: Sequence[Sequence[str]], seed: int, progress: Progress) -> None:
     """Matches and verifies the chosen pairs of photos, given by their names in the database."""
     pycolmap = load_pycolmap()
     progress.update("poses: matching", 0, len(chosen))

@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from perception.photos.lens import load_pycolmap
@@ -44,13 +45,9 @@ def map_photos(
 ) -> Mapped:
     """All models, largest first (pycolmap does not sort them), and names of photos left out as contradicted.
     fixed: the intrinsics in the database are not refined. one_thread: also for more than REPEATABLE_PHOTOS photos."""
-    folder = store.folder / "mapping"
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
-    try:
-        return _Mapping(store, folder, fixed, seed, count, progress, one_thread or count <= REPEATABLE_PHOTOS).run()
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+    with TemporaryDirectory(dir=store.folder) as folder:
+        one_thread = one_thread or count <= REPEATABLE_PHOTOS
+        return _Mapping(store, Path(folder), fixed, seed, count, progress, one_thread).run()
 
 
 @dataclass
@@ -75,9 +72,7 @@ class _Mapping:
             tried.append((sum(pair.inliers for pair in pairs if pair.agrees), found))
             if not is_contradicted(pairs):
                 break
-        if not tried:
-            return [], set()
-        return max(tried, key=lambda item: item[0])[1]
+        return max(tried, key=lambda item: item[0], default=(0, ([], set())))[1]
 
     def _candidates(self) -> Iterator[Mapped]:
         """For each level: a model from its pairs, then one from all pairs except those that the first contradicts."""

@@ -34,10 +34,8 @@ def without_repeats(models: Sequence[Any]) -> list[Any]:
 
 def align(models: Sequence[Any], seed: int) -> list[list[Any]]:
     """Groups of models that share photos, the largest group first; those of a group are moved into one frame.
-
     Models with most photos in common are joined first. A similarity moves one so that the points of either lie where
-    the photos in both show them.
-    """
+    the photos in both show them."""
     pycolmap = load_pycolmap()
     pycolmap.set_random_seed(seed)
     photos = [set(each.reg_image_ids()) for each in models]

@@ -28,14 +28,12 @@ def views_of_model(
     lenses = {camera_id: lens_from_camera(camera) for camera_id, camera in model.cameras.items()}
     for image_id, (name, photo) in located.items():
         image = model.images[image_id]
-        there = photo.is_file()
-        why = why_left_out(photo, options.strict) if there else "in the sparse model, but the photo is missing"
-        if why is not None:
+        missing_photo = "in the sparse model, but the photo is missing"
+        if why := why_left_out(photo, options.strict) if photo.is_file() else missing_photo:
             missing.append({"name": name, "why": why})
             continue
         lens, note = fit_lens(lenses[image.camera_id], photo, source)
-        pose = np.eye(4)
-        pose[:3] = image.cam_from_world().matrix()
+        pose = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
         views.append(replace(make_view(name, photo, lens, pose, source), mask=mask_of(options.masks, name)))
         if note:
             notes.add(note)

@@ -68,10 +68,10 @@ def similar_photos(descriptors: list[np.ndarray]) -> np.ndarray:
     for first in range(0, count, AT_ONCE):
         some = descriptors[first : first + AT_ONCE]
         features = np.concatenate(some)
-        word = (features @ centres.T - half).argmax(axis=1)  # the nearest centre
-        row = np.repeat(np.arange(len(some)), [len(each) for each in some]) * WORDS + word
+        nearest = (features @ centres.T - half).argmax(axis=1)
+        row = np.repeat(np.arange(len(some)), [len(each) for each in some]) * WORDS + nearest
         entries = (np.ones(len(row), np.float32), (row, np.arange(len(row))))
-        sums = sparse.csr_matrix(entries, shape=(len(some) * WORDS, len(row))) @ (features - centres[word])
+        sums = sparse.csr_matrix(entries, shape=(len(some) * WORDS, len(row))) @ (features - centres[nearest])
         vlads[first : first + AT_ONCE] = sums.reshape(-1, WORDS, 128)
     vlads /= np.maximum(np.linalg.norm(vlads, axis=2, keepdims=True), 1e-9)
     rows = vlads.reshape(count, -1)

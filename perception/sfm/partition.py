@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from heapq import heapify, heappop, heappush
-
 import networkx as nx
 import numpy as np
 from scipy import sparse
@@ -66,10 +64,8 @@ def _upper_half(weights: sparse.csr_matrix) -> np.ndarray:
 
 def with_overlap(submodels: list[list[int]], matches: Matches) -> list[list[int]]:
     """The photos of each submodel, and OVERLAP photos of each next to it, those that lead into it.
-
     Next to each other are the neighbours in the maximum spanning tree by the strongest pair of photos of two submodels:
-    submodels that only look alike are not.
-    """
+    submodels that only look alike are not."""
     submodel_of = {image: n for n, images in enumerate(submodels) for image in images}
     linked: dict[int, dict[int, int]] = {image: {} for image in submodel_of}
     graph = nx.Graph()
@@ -88,14 +84,10 @@ def with_overlap(submodels: list[list[int]], matches: Matches) -> list[list[int]
 
 def _leading(images: list[int], other: set[int], linked: dict[int, dict[int, int]]) -> list[int]:
     """OVERLAP photos of `other`, each the one with the strongest pair with `images` or those before it."""
-    waiting = [(-count, image) for known in images for image, count in linked[known].items() if image in other]
     chosen: list[int] = []
-    heapify(waiting)
+    waiting = [(count, -image) for known in images for image, count in linked[known].items() if image in other]
     while waiting and len(chosen) < OVERLAP:
-        image = heappop(waiting)[1]
-        if image not in chosen:
-            chosen.append(image)
-            for new, count in linked[image].items():
-                if new in other:
-                    heappush(waiting, (-count, new))
+        chosen.append(-max(waiting)[1])
+        waiting += [(count, -image) for image, count in linked[chosen[-1]].items() if image in other]
+        waiting = [pair for pair in waiting if -pair[1] not in chosen]
     return chosen

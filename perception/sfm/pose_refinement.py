@@ -52,10 +52,8 @@ def match_errors(features: Features, poses: Poses) -> tuple[np.ndarray, np.ndarr
 
 def checked_poses(views: list[View], features: Features, mode: str) -> tuple[list[View], dict[str, Any]]:
     """`views` as given or with refined poses, and the report's entries: "poses", "notes", "warnings".
-
     mode: "auto" refines poses that are worse than TOLERANCE, "refine" any that gain by it. Views that are held out for
-    scoring are refined as well, by features and depth alone.
-    """
+    scoring are refined as well, by features and depth alone."""
     given = poses_of(views)
     if len(features.pairs) < LEAST_MATCHES:
         note = f"given poses not checked: {len(features.pairs)} matched features, {LEAST_MATCHES} are needed"
@@ -63,15 +61,12 @@ def checked_poses(views: list[View], features: Features, mode: str) -> tuple[lis
     side = max(max(lens.width, lens.height) for lens in map(view_lens, views))
     before, good = _medians(features, given), TOLERANCE * max(1.0, side / TOLERANCE_SIDE)
     facts: dict[str, Any] = {"refined": False, "given_error_px": before}
-    report: dict[str, Any] = {
-        "poses": facts,
-        "notes": [f"given poses: matched features {_text(before)}"],
-        "warnings": [],
-    }
+    notes, warnings = [f"given poses: matched features {_text(before)}"], list[str]()
+    report = {"poses": facts, "notes": notes, "warnings": warnings}
     usable, unit = views, _depth_unit(features, given)
     if not 1 / UNIT < unit < UNIT:
         what = f"features triangulate at {unit:.3g} times their measured depth, as if in another unit than the poses"
-        report["warnings"] = [f"{what}; depth is not used"]
+        warnings.append(f"{what}; depth is not used")
         usable, features = [replace(v, depth=None) for v in views], replace(features, depth=0 * features.depth)
     if mode == "auto" and before["epipolar"] <= good:
         return usable, report
@@ -80,10 +75,10 @@ def checked_poses(views: list[View], features: Features, mode: str) -> tuple[lis
     if after["epipolar"] <= min(IMPROVED * before["epipolar"], HOPELESS * good):
         changes, text = _changes(refined.since(given))
         facts |= {"refined": True, "error_px": after, **changes}
-        report["notes"].append(f"refined poses: {_text(after)}; {text}")
+        notes.append(f"refined poses: {_text(after)}; {text}")
         return [replace(v, camera_from_world=m) for v, m in zip(usable, refined.matrices(), strict=True)], report
     if before["epipolar"] <= HOPELESS * good:
-        report["notes"].append(f"refining them gains little ({_text(after)}); they are used as they are")
+        notes.append(f"refining them gains little ({_text(after)}); they are used as they are")
         return usable, report
     warning = "the given poses do not fit the photos, and refining them did not help; they are used as they are"
     return views, {**report, "warnings": [warning]}
@@ -105,7 +100,7 @@ def refine(features: Features, given: Poses) -> Poses:
 
 
 def moved_back(poses: Poses, given: Poses, distance: float) -> Poses:
-    """`poses` moved as a whole to where what the cameras see, at `distance`, lies as by the given ones.
+    """`poses` moved together to where what the cameras see, at `distance`, lies as by the given ones.
     Least sum of the displacements of five points ahead of each camera, by reweighting: the priors hold them loosely."""
     ahead = distance * np.array([[0, 0, 1], [0.4, 0, 1], [-0.4, 0, 1], [0, 0.4, 1], [0, -0.4, 1]])
     a, b = ((np.einsum("nji,kj->nki", p.rotation, ahead) + p.center[:, None]).reshape(-1, 3) for p in (poses, given))

@@ -36,8 +36,7 @@ def reconstruct(folder: Path, options: ReadOptions) -> Scene:
     Results in the workdir are reused for unchanged photos, lens and seed. `choose_photos` decides which photos are left
     out.
     """
-    lens = options.lens
-    chosen = choose_photos(folder, options.strict, options.progress)
+    lens, chosen = options.lens, choose_photos(folder, options.strict, options.progress)
     photos = chosen.photos
     if len(photos) < MIN_PHOTOS:
         raise _too_few(folder, chosen)
@@ -71,14 +70,12 @@ def _map(store: FeatureStore, chosen: PhotoSet, folder: Path, options: ReadOptio
     done, fixed = store.folder / "model", options.lens is not None
     recover(done)
     if not done.is_dir():
-        started = time.perf_counter()
-        found = None
-        if len(chosen.photos) > REPEATABLE_PHOTOS:
-            found = map_submodels(store, fixed, options)
-        models, contradicted = found or map_photos(store, fixed, options.seed, len(chosen.photos), options.progress)
+        started, count = time.perf_counter(), len(chosen.photos)
+        found = map_submodels(store, fixed, options) if count > REPEATABLE_PHOTOS else None
+        models, contradicted = found or map_photos(store, fixed, options.seed, count, options.progress)
         if not models:
             advice = "take sharp, overlapping photos of a textured scene from different positions"
-            raise InputError(f"{folder}: none of the {len(chosen.photos)} photos could be registered; {advice}")
+            raise InputError(f"{folder}: none of the {count} photos could be registered; {advice}")
         seconds = {**store.facts["seconds"], "mapping": time.perf_counter() - started}
         report = _report(models, contradicted, store, chosen.names, seconds)
         with atomic_directory(done) as new:
@@ -90,18 +87,14 @@ def _map(store: FeatureStore, chosen: PhotoSet, folder: Path, options: ReadOptio
 def _report(
     models: list[Any], contradicted: set[str], store: FeatureStore, shown: list[str], seconds: dict[str, float]
 ) -> dict[str, Any]:
-    best = models[0]
+    best, matches = models[0], _best_partners(store)
     inside = [{model.images[i].name for i in model.reg_image_ids()} for model in models]
-    matches = _best_partners(store)
-    left_out = []
-    for name, photo in zip(store.names, shown, strict=True):
-        if name not in inside[0]:
-            left_out.append({"name": photo, "why": _reason(name, contradicted, inside[1:], matches)})
+    outside = [(name, photo) for name, photo in zip(store.names, shown, strict=True) if name not in inside[0]]
     return {
         "input": "photos",
         "photos": len(shown),
         "registered": len(inside[0]),
-        "left_out": left_out,
+        "left_out": [{"name": p, "why": _reason(n, contradicted, inside[1:], matches)} for n, p in outside],
         "models": [len(names) for names in inside],
         "points": best.num_points3D(),
         "mean_reprojection_error_px": float(best.compute_mean_reprojection_error()),

@@ -13,27 +13,25 @@ from pathlib import Path
 from PIL import Image
 
 from perception.machine import cores
-from perception.photos.decode import LARGE_PIXELS, exif_folder, exif_of, open_photo, read_photo
+from perception.photos.decode import CAMERA_FOLDER, LARGE_PIXELS, ORIENTATION, exif_of, open_photo, read_photo
 from perception.progress import Progress
 
 _PLAIN = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}
 """Formats that pycolmap reads as they are (MPO: a JPEG followed by further images)."""
-_EXIF_FOLDER, _MAKE_AND_MODEL = 0x8769, (0x010F, 0x0110)
+_MAKE_AND_MODEL = (0x010F, 0x0110)
 _FOCAL_LENGTH = (0x920A, 0xA405, 0xA20E, 0xA20F, 0xA210)
 """EXIF tags: focal length in mm, the same for 35 mm film, resolution of the focal plane in x and y and its unit."""
 
 
 def stage_photos(folder: Path, photos: list[Path], progress: Progress) -> list[str]:
     """Fills the new `folder`; returns the names there, in the order of `photos`, which is also their sorted order.
-
     Upright JPEG and PNG are linked. Others are written as PNG, which keeps the pixels of every 8-bit format (16 bits
-    become 8), with the EXIF data that tell the focal length, by several threads.
-    """
+    become 8), with the EXIF data on the focal length, by several threads."""
     folder.mkdir()
     names, converted = [], []
     for index, photo in enumerate(photos):
         with open_photo(photo) as image:
-            plain = exif_of(image, photo).get(0x0112, 1) == 1 and image.mode in ("RGB", "L")
+            plain = exif_of(image, photo).get(ORIENTATION, 1) == 1 and image.mode in ("RGB", "L")
             small = image.width * image.height <= LARGE_PIXELS
             suffix = _PLAIN.get(image.format or "") if plain and small else None
         names.append(f"{index:06d}{suffix or '.png'}")
@@ -55,6 +53,6 @@ def _convert(photo: Path, target: Path) -> None:
     with open_photo(photo) as image:
         exif = exif_of(image, photo)
         kept.update({tag: exif[tag] for tag in _MAKE_AND_MODEL if tag in exif})
-        lens = exif_folder(image, photo, _EXIF_FOLDER)
-        kept.get_ifd(_EXIF_FOLDER).update({tag: lens[tag] for tag in _FOCAL_LENGTH if tag in lens})
+        lens = exif_of(image, photo, CAMERA_FOLDER)
+        kept.get_ifd(CAMERA_FOLDER).update({tag: lens[tag] for tag in _FOCAL_LENGTH if tag in lens})
     Image.fromarray(read_photo(photo)).save(target, compress_level=1, exif=kept)

@@ -65,11 +65,10 @@ def _task(store: FeatureStore, images: list[int], number: int, fixed: bool, seed
 
 def submodel_task(task: str, progress: Progress = QUIET) -> None:
     """Maps the submodel whose task lies in folder `task`, and writes its models to RESULT there."""
-    folder = Path(task)
-    facts = read_facts(folder)
+    folder, facts = Path(task), read_facts(Path(task))
     if (folder / RESULT).is_dir():
         return
-    store = FeatureStore(folder, [], {}, Path(facts["photos"]))
+    store = FeatureStore(folder, Path(facts["photos"]), [], {})
     models, _ = map_photos(store, facts["fixed"], facts["seed"], facts["count"], progress, one_thread=True)
     with atomic_directory(folder / RESULT) as new:
         for number, model in enumerate(models):

@@ -22,10 +22,8 @@ MOST_POINTS = 20_000
 @dataclass(frozen=True)
 class Features:
     """F features of all photos. view [F]: index. rays [F, 2]: x/z, y/z in camera axes. focal [F]: pixels per ray unit.
-
     depth [F]: measured along the optical axis in scene units, 0 = none. pairs [M, 2]: matches that agree with one
-    motion of the camera, whatever the given poses, in fixed order.
-    """
+    motion of the camera, whatever the given poses, in fixed order."""
 
     view: np.ndarray
     rays: np.ndarray

@@ -56,21 +56,31 @@ def triangulated_cloud(
     views: list[View], store: FeatureStore, seed: int
 ) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
     """points [P, 3] float64 in the world of the views, colors [P, 3] uint8, facts for the report.
-
     store: the matched features of the views (see sfm.database). With fewer than MIN_POINTS points, random points in the
-    view frusta are returned, with a warning.
-    """
-    points, colors, error = _triangulate(views, store, seed)
+    view frusta are returned, with a warning."""
+    pycolmap, model = load_pycolmap(), load_pycolmap().Reconstruction()
+    with pycolmap.Database.open(store.database) as db:
+        images = [db.read_image_with_name(name) for name in store.names]
+    for view, image in zip(views, images, strict=True):
+        if image.camera_id not in model.cameras:
+            model.add_camera_with_trivial_rig(camera_from_lens(view_lens(view), image.camera_id))
+        plain = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
+        model.add_image_with_trivial_frame(plain, pycolmap.Rigid3d(view.camera_from_world[:3]))
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = seed
+    options.num_threads = 1  # the order of sums in several threads is not repeatable
+    options.ba_refine_focal_length = options.ba_refine_extra_params = False
+    with TemporaryDirectory(dir=store.folder) as out:
+        model = pycolmap.triangulate_points(model, store.database, store.image_root, out, True, options)
+    points, colors = cloud_of(model)
+    error = float(model.compute_mean_reprojection_error()) if len(points) else None
     facts: dict[str, Any] = {"points_from": "triangulated", "mean_reprojection_error_px": error, "warnings": []}
     if len(points) < MIN_POINTS:
-        measured = any(view.depth for view in views)
-        facts["warnings"].append(
-            f"only {len(points)} points could be triangulated with the given poses (are they right?); "
-            + ("depth images" if measured else f"{FALLBACK_POINTS} random points in the cameras' view")
-            + " are used instead"
-        )
+        others = f"{FALLBACK_POINTS} random points in the cameras' view"
+        others = "depth images" if any(view.depth for view in views) else others
+        few = f"only {len(points)} points could be triangulated with the given poses (are they right?)"
+        facts |= {"points_from": "random", "warnings": [f"{few}; {others} are used instead"]}
         points, colors = random_cloud(views, seed)
-        facts["points_from"] = "random"
     return points, colors, facts
 
 
@@ -88,23 +98,3 @@ def random_cloud(views: list[View], seed: int) -> Cloud:
         ray = np.c_[pixel, np.ones(len(pixel))] @ np.linalg.inv(view.K).T * depth[mine, None]
         points[mine] = ray @ worlds[index, :3, :3].T + worlds[index, :3, 3]
     return points, np.full((FALLBACK_POINTS, 3), 128, np.uint8)
-
-
-def _triangulate(views: list[View], store: FeatureStore, seed: int) -> tuple[np.ndarray, np.ndarray, float | None]:
-    pycolmap = load_pycolmap()
-    model = pycolmap.Reconstruction()
-    with pycolmap.Database.open(store.database) as db:
-        images = [db.read_image_with_name(name) for name in store.names]
-    for view, image in zip(views, images, strict=True):
-        if image.camera_id not in model.cameras:
-            model.add_camera_with_trivial_rig(camera_from_lens(view_lens(view), image.camera_id))
-        plain = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
-        model.add_image_with_trivial_frame(plain, pycolmap.Rigid3d(view.camera_from_world[:3]))
-    options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = seed
-    options.num_threads = 1  # the order of sums in several threads is not repeatable
-    options.ba_refine_focal_length = options.ba_refine_extra_params = False
-    with TemporaryDirectory(dir=store.folder) as out:
-        model = pycolmap.triangulate_points(model, store.database, store.image_root, out, True, options)
-    points, colors = cloud_of(model)
-    return points, colors, float(model.compute_mean_reprojection_error()) if len(points) else None

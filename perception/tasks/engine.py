@@ -49,10 +49,8 @@ def _join(ray: Any, address: str | None) -> None:
 @dataclass(frozen=True)
 class Engine:
     """kind: of ENGINES. address: of a running Ray cluster ("auto": the one of this machine); None starts one here.
-
     Tasks get and leave their data in folders that every worker reaches under the same path. The results do not depend
-    on the kind and on the number of workers.
-    """
+    on the kind and on the number of workers."""
 
     kind: str = "local"
     address: str | None = None
@@ -61,10 +59,8 @@ class Engine:
         self, task: Callable[..., Any], items: Sequence[str], what: str, progress: Progress, each_core: bool = False
     ) -> list[Any]:
         """task(item) of each item, in order; the first error is raised. what: a task's name in messages.
-
-        A task must take up what an interrupted call has left. each_core: a task uses one core and shows its progress
-        at least every few seconds, by which it is stopped here when the call is interrupted.
-        """
+        A task must take up what an interrupted call has left. each_core: a task uses one core and shows its progress at
+        least every few seconds, by which it is stopped here when the call is interrupted."""
         if self.kind == "ray":
             return self._on_ray(task, items, what, progress, each_core)
         if each_core:
@@ -82,7 +78,7 @@ class Engine:
             import ray
         except ImportError as error:
             raise missing_extra("ray", "ray") from error
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is told to others
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no statistics are sent
         started = not ray.is_initialized()
         try:
             if self.address not in (None, "auto"):  # Ray itself tries for seven minutes
@@ -91,13 +87,9 @@ class Engine:
             if started:
                 _join(ray, self.address)
         except (OSError, ValueError) as error:
-            why = str(error).splitlines()[0]
-            if self.address is None:
-                raise InputError(
-                    f"Ray cannot start a cluster here ({why}); start one, and give its --address"
-                ) from error
-            told = f"--address {self.address}: no Ray cluster there ({why})"
-            raise InputError(f"{told}; start one: ray start --head, and give its HOST:PORT") from error
+            here, there = "Ray cannot start a cluster here", f"--address {self.address}: no Ray cluster there"
+            found = f"{here if self.address is None else there} ({str(error).splitlines()[0]})"
+            raise InputError(f"{found}; start one: ray start --head, and give its --address HOST:PORT") from error
         try:
             host = ray.util.get_node_ip_address()
             if started and self.address is None and not host.startswith("127."):
@@ -107,13 +99,13 @@ class Engine:
             offered = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]
             taken = 1 if each_core else min(filter(None, offered), default=1)
             remote = ray.remote(task).options(num_cpus=taken, max_retries=RETRIES)
-            asked = [remote.remote(item) for item in items]
-            waiting = list(asked)
+            submitted = [remote.remote(item) for item in items]
+            waiting = submitted
             while waiting:
                 done, waiting = ray.wait(waiting, num_returns=1)
                 ray.get(done)
                 progress.update(f"{what}s", len(items) - len(waiting), len(items))
-            return list(ray.get(asked))
+            return list(ray.get(submitted))
         except ray.exceptions.RayTaskError as error:
             raise (error.cause if isinstance(error.cause, InputError) else error) from None
         except ray.exceptions.RayError as error:
@@ -143,13 +135,13 @@ def _on_cores(task: Callable[..., Any], items: Sequence[str], what: str, progres
     """As many tasks at a time as there are cores, each in a thread of its own."""
     stop = threading.Event()
     with ThreadPoolExecutor(cores()) as pool:
-        asked = [pool.submit(task, item, _Stoppable(stop)) for item in items]
+        submitted = [pool.submit(task, item, _Stoppable(stop)) for item in items]
         try:
             progress.update(f"{what}s", 0, len(items))
-            for done, one in enumerate(as_completed(asked), start=1):
+            for done, one in enumerate(as_completed(submitted), start=1):
                 one.result()
                 progress.update(f"{what}s", done, len(items))
-            return [one.result() for one in asked]
+            return [one.result() for one in submitted]
         finally:
             stop.set()
             pool.shutdown(cancel_futures=True)

@@ -29,7 +29,7 @@ def write_task(folder: Path, scene: Scene | None = None, **facts: Any) -> None:
 
 
 def has_task(folder: Path) -> bool:
-    """Whether a whole task lies in `folder`."""
+    """Whether a complete task lies in `folder`."""
     return (folder / TASK).is_file()
 
 

@@ -103,7 +103,7 @@ def test_depth_tells_a_metric_world_and_is_converted_in_another(tmp_path: Path) 
     assert other.views[0].depth.scale == pytest.approx(0.002, rel=1e-3)
     assert "converted to the unit of the poses" in other.report["warnings"][-1]
     wrong = in_world_frame(replace(halved, metric=True), FrameConfig())
-    assert wrong.metric and "the input says its unit is the metre, but" in wrong.report["warnings"][-2]
+    assert wrong.metric and "the input states that its unit is the metre, but" in wrong.report["warnings"][-2]
     assert wrong.views[0].depth is not None and wrong.views[0].depth.scale == pytest.approx(0.002, rel=1e-3)
 
 

@@ -151,7 +151,9 @@ GOOD = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty flo
         ("a.ply", b"ply\nformat ascii 1.0\n", "cut short"),
         ("a.ply", GOOD + b"end_header\n1 2\n", "cut short"),
         ("a.ply", GOOD + b"end_header\n1 two 3\n", "numbers are expected"),
-        ("a.ply", GOOD.replace(b"ascii", b"binary_little_endian") + b"end_header\n\0\0", "0 whole rows"),
+        ("a.ply", GOOD + b"end_header\n1 2 3 4\n", "more numbers"),
+        ("a.pcd", pcd("x y z", "4 4 4", "F F F", 1, "ascii") + b"1 2 3 4\n", "more numbers"),
+        ("a.ply", GOOD.replace(b"ascii", b"binary_little_endian") + b"end_header\n\0\0", "0 complete rows"),
         ("a.ply", GOOD.replace(b"vertex 1", b"vertex 0") + b"end_header\n", "no points"),
         ("a.ply", GOOD.replace(b"float z", b"float w") + b"end_header\n1 2 3\n", "x, y and z"),
         (
@@ -186,7 +188,7 @@ def test_a_file_that_cannot_fit_is_refused_before_it_is_read(tmp_path, monkeypat
 def test_a_header_that_promises_too_much_is_cut_short_not_out_of_memory(tmp_path):
     head = GOOD.replace(b"ascii", b"binary_little_endian").replace(b"vertex 1", b"vertex 999999999999")
     (tmp_path / "c.ply").write_bytes(head + b"end_header\n" + bytes(24))
-    with pytest.raises(InputError, match="2 whole rows, header says 999999999999"):
+    with pytest.raises(InputError, match="2 complete rows, its header says 999999999999"):
         read_cloud(tmp_path / "c.ply")
 
 

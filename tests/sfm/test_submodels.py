@@ -111,7 +111,7 @@ def walk(folder: Path, rng: np.random.Generator) -> tuple[FeatureStore, np.ndarr
             geometry.inlier_matches = found
             db.write_two_view_geometry(ids[i], ids[j], geometry)
     db.close()
-    return FeatureStore(folder, names, {}), np.array(centres)
+    return FeatureStore(folder, folder / "photos", names, {}), np.array(centres)
 
 
 def poses(model: Any) -> dict[str, bytes]:
