@@ -43,7 +43,7 @@ def write_labels(file: Path, labels: np.ndarray, key: str = "") -> None:
         raise ValueError(f"{file}: labels must lie in 0..65535, found {labels.min()}..{labels.max()}")
     info = PngImagePlugin.PngInfo()
     info.add_text(_KEY, key)
-    with atomic_file(file) as aside:
+    with atomic_file(file, parents=True) as aside:
         Image.fromarray(labels.astype(np.uint16)).save(aside, "PNG", compress_level=4, pnginfo=info)
 
 

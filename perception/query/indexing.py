@@ -47,7 +47,7 @@ def index_maps(
     >>> counts = index_maps(Path("all.store"), [Path("kitchen.gsmap")])
     >>> counts["added"], counts["instances"]
     (1, 9)
-    >>> perception.load_map("all.store").query("red mug")[0].map_id == load_map("kitchen.gsmap").map_id
+    >>> perception.load_map("all.store").query("red mug")[0].map_id == perception.load_map("kitchen.gsmap").map_id
     True
     """
     encoders = lru_cache(encoders or make_encoder)

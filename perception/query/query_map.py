@@ -40,7 +40,7 @@ class QueryMap(Map):
     A method with `frame` takes and returns points, poses, boxes and lengths in that frame. Without it, they are in the
     map's own frame (`frame`), in metres when `metric`. Methods raise InputError for bad arguments and damaged files.
 
-    >>> gmap = load_map("kitchen.gsmap")
+    >>> gmap = perception.load_map("kitchen.gsmap")
     >>> [hit.instance_id for hit in gmap.query("red mug")]
     [0]
     >>> nearest = gmap.nearest([2.0, 0.0, 1.0])[0]  # a point [3] in the map's frame

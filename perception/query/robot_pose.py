@@ -39,10 +39,12 @@ class RobotPose:
 
     @property
     def position(self) -> np.ndarray:
+        """[3] of the robot's centre on the floor, metres in `frame`."""
         return self.map_from_robot[:3, 3]
 
     @property
     def yaw(self) -> float:
+        """Of x about z, radians."""
         return float(np.arctan2(self.map_from_robot[1, 0], self.map_from_robot[0, 0]))
 
 

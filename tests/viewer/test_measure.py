@@ -156,7 +156,7 @@ def test_ends_that_measure_nothing_are_refused(path: Path) -> None:
     with pytest.raises(InputError, match="click both ends"):
         session.set_scale(1.0)
     session.pick(np.zeros(3), FRONT)
-    with pytest.raises(InputError, match="two different places"):
+    with pytest.raises(InputError, match="two different points"):
         session.set_scale(1.0)
     session.ends[1] = session.ends[1] + 0.01
     with pytest.raises(InputError, match="too near each other"):
