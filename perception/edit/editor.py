@@ -70,7 +70,7 @@ class Editor:
     """
 
     def __init__(self, path: Path):
-        self.path = Path(path)
+        self.path = Path(path) if Path(path).name else Path(path).absolute()
         self._lock = threading.RLock()
         read_info(self.path)  # its error is the clearest when there is no map
         self._signature = map_signature(self.path)

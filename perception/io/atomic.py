@@ -71,6 +71,8 @@ def _aside(path: Path, make: Callable[[Path], Any], put: Callable[[Path, Path], 
     path = pointed(path)
     temporary = _sibling(path, "new")
     try:
+        if path.exists() and not path.is_file() and not path.is_dir():
+            raise InputError(f"{path}: is a pipe, a socket or a device, which stays as it is; give another place")
         path.parent.mkdir(parents=True, exist_ok=True)
         recover(path)
         with _locked(temporary, lambda: make(temporary)):
