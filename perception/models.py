@@ -205,7 +205,7 @@ def _install(name: str, files: Sequence[tuple[str, Path, str]]) -> StoredModel:
     target, known = models_folder() / name, find_model(name)
     made = {RECORD, *(file["name"] for file in ([] if known is None else known.files))}
     for file in target.rglob("*"):
-        if not file.is_dir() and str(file.relative_to(target)) not in made:
+        if (file.is_symlink() or not file.is_dir()) and str(file.relative_to(target)) not in made:
             raise InputError(f"{file}: was not added as a part of '{name}', and would be lost; move it elsewhere")
     with atomic_directory(target) as folder:
         entries = []

@@ -22,7 +22,7 @@ from support.box_rooms import FURNISHED, map_of
 from support.query_maps import encoders, write_map_of
 
 NAMES = re.findall(r"`(perception\.[\w.]+)`", perception.__doc__ or "")
-RESULTS = {"Description", "Neighbor", "Reply", "Stand", "ExportOptions"}
+RESULTS = {"Description", "Neighbor", "Reply", "RobotPose", "ExportOptions"}
 """They hold values alone and raise nothing."""
 KITCHEN = ["red mug", "banana", "laptop", "teapot", "kettle", "lamp", "violin", "anchor", "drum"]
 SHAPE = re.compile(r"\[[A-Z\d][A-Z\d, +]*\]")

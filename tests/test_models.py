@@ -125,6 +125,14 @@ def test_files_that_were_not_added_are_not_replaced(sam: tuple[Path, Path]) -> N
     for _ in range(2):
         add_model("mine", [str(file) for file in sam])
     notes = models_folder() / "mine" / "notes.txt"
+    notes.symlink_to("nowhere")
+    with pytest.raises(InputError, match=r"notes\.txt: was not added"):
+        add_model("mine", [str(file) for file in sam])
+    notes.unlink()
+    notes.symlink_to(models_folder(), target_is_directory=True)
+    with pytest.raises(InputError, match=r"notes\.txt: was not added"):
+        add_model("mine", [str(file) for file in sam])
+    notes.unlink()
     notes.write_text("where it came from")
     with pytest.raises(InputError, match=r"notes\.txt: was not added"):
         add_model("mine", [str(sam[0])])

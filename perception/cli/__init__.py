@@ -43,7 +43,7 @@ def _warn(message: Warning | str, category: type[Warning], *_: object, **__: obj
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one command; returns the exit code: 0, 2 for bad usage or input, 130 on Ctrl-C."""
+    """Runs one command; returns the exit code: 0, 2 for bad usage, input or paths, 130 on Ctrl-C."""
     # Threads of torch's OpenMP that spin while they wait would take the cores from the kernels' own threads.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     limit_threads()
@@ -67,4 +67,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
     except BrokenPipeError:
         return 0
+    except OSError as error:  # a path that the system refuses, wherever it is used first
+        if error.filename is None or error.strerror is None:
+            raise
+        told = InputError(f"{error.filename}: {error.strerror}; give another path, or allow access to this one")
+        print(f"error: {' '.join(str(told).split())}", file=sys.stderr)
+        return 2
     return 0

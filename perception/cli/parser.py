@@ -31,7 +31,8 @@ class Parser(argparse.ArgumentParser):
 
 def _path(text: str) -> Path:
     try:
-        return local_path(text)
+        path = local_path(text)
+        return path if path.name else path.absolute()  # a map that is written anew takes the working folder's name
     except InputError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
 

@@ -71,7 +71,7 @@ class Editor:
     """
 
     def __init__(self, path: Path):
-        self.path = Path(path)
+        self.path = Path(path) if Path(path).name else Path(path).absolute()
         self._lock = threading.RLock()
         self.reopen()
 

@@ -79,6 +79,8 @@ def aside(
     path = pointed(path)
     temporary = _sibling(path, "new")
     try:
+        if path.exists() and not path.is_file() and not path.is_dir():
+            raise InputError(f"{path}: is a pipe, a socket or a device, which stays as it is; give another path")
         recover(path, discard)
         with _locked(temporary, lambda: make(temporary)):
             yield temporary

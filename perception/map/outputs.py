@@ -22,8 +22,8 @@ MAP_FILES = (FACTS, EDITABLE, *DATA)
 def refuse_inputs(outputs: Iterable[Path | None], inputs: Iterable[Path | None]) -> None:
     """InputError if a file to write is an input, a map's own or written twice: by its path, by links or by hard links.
 
-    outputs: files. inputs: files, and maps or stores, of which their own files and the photos are meant. None is
-    skipped.
+    outputs: files. inputs: files, and maps or stores, of which their own files and all that they were made from are
+    meant. None is skipped.
     """
     read: dict[Any, Path] = {}
     for file in (file for source in inputs if source is not None for file in _files(source)):
@@ -50,6 +50,8 @@ def check_side_file(side: Path, output: Path, key: str = "") -> None:
     if not os.path.lexists(side):
         return
     try:
+        if not side.is_file():  # reading a named pipe would wait for its writer
+            raise ValueError
         if side.suffix == ".npy":
             ids = np.load(side, mmap_mode="r")
             good = ids.dtype == np.int32 and ids.ndim == 1
@@ -71,7 +73,7 @@ def _identities(file: Path) -> Iterator[Any]:
 
 
 def _files(source: Path) -> Iterator[Path]:
-    """The file itself, or the files of a map with the photos of its views, or those of a store."""
+    """The file itself, or the files of a map with its photos and what else it was made from, or those of a store."""
     if not source.is_dir():
         yield source
     elif (source / STORE).is_file():
@@ -80,7 +82,11 @@ def _files(source: Path) -> Iterator[Path]:
         yield from (source / name for name in MAP_FILES)
         # The command itself reports what is wrong with its map.
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-            for view in json.loads((source / FACTS).read_bytes())["views"]:
+            facts = json.loads((source / FACTS).read_bytes())
+            for key, names in facts.get("inputs", {}).items():
+                named = Path(key.partition("=")[2])
+                yield from ((named if named.is_dir() else named.parent) / name for name in names)
+            for view in facts["views"]:
                 yield Path(view["photo"])
                 if view.get("photo_beside") is not None:
                     yield absolute(pointed(source) / view["photo_beside"])

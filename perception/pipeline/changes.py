@@ -20,9 +20,8 @@ from perception.masks.sam_models import sam_graphs
 from perception.onnx.sessions import side_files
 from perception.onnx.store import resolve
 from perception.photos.folder import list_photos
-from perception.pipeline.checkpoint import frames_folder, work_folder
+from perception.pipeline.checkpoint import INPUTS, frames_folder, work_folder
 
-INPUTS = "inputs.json"
 CONFIGURATIONS = (
     *("config.json", "tokenizer.json", "tokenizer_config.json"),
     *("preprocessor_config.json", "preprocess_cfg.json", "open_clip_config.json"),
@@ -37,19 +36,24 @@ Inputs = dict[str, dict[str, str]]
 def inputs_of(source: Path, config: MapConfig, output: Path) -> Inputs:
     """The files that the map of `source` at `output` is made from, without those that its run writes.
     InputError where `source` is no input, or lists its photos in a file that cannot be read."""
-    own = {folder.resolve() for folder in (output, work_folder(output), frames_folder(output))}
+    own = {_real(folder) for folder in (output, work_folder(output), frames_folder(output))}
     found: Inputs = {}
     try:
         for setting, path, files in _named(source.absolute(), config, frames_folder(output).absolute()):
-            base, others = path if path.is_dir() else path.parent, own - {path.resolve()}
-            folders = {folder: folder.resolve() for folder in {file.parent for file in files}}
+            base, others = path if path.is_dir() else path.parent, own - {_real(path)}
+            folders = {folder: _real(folder) for folder in {file.parent for file in files}}
             written = {folder for folder, real in folders.items() if others & {real, *real.parents}}
             stats = {file: file.stat() for file in files if file.parent not in written}
             facts = {os.path.relpath(file, base): f"{stat.st_size} {stat.st_mtime_ns}" for file, stat in stats.items()}
-            found.setdefault(f"{setting}={path.resolve()}", {}).update(facts)
+            found.setdefault(f"{setting}={_real(path)}", {}).update(facts)
     except OSError as error:
         raise InputError(f"{error.filename}: cannot be read ({error.strerror}); allow it, or remove it") from error
     return found
+
+
+def _real(path: Path) -> Path:
+    """The path without links, as far as they lead anywhere."""
+    return Path(os.path.realpath(path))
 
 
 def _named(source: Path, config: MapConfig, frames: Path) -> Iterator[tuple[str, Path, list[Path]]]:

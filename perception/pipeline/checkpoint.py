@@ -16,9 +16,11 @@ be hours of work. With other masks (another labels:DIR), training restarts at th
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
 import json
+import os
 import pickle
 import shutil
 import time
@@ -34,6 +36,7 @@ from perception.inputs.readers import EXPECTED
 from perception.io.atomic import atomic_file
 from perception.machine import peak_memory_mib
 from perception.map.replace import writing
+from perception.photos.video import FRAMES_RECORD
 from perception.progress import Progress
 
 CHECKPOINT = "checkpoint.pt"
@@ -49,14 +52,14 @@ def fingerprint(source: Path, config: MapConfig) -> str:
     """Hash of the input path and all settings that change the map, without memory, time_limit and device."""
     settings = config.to_json() | {"device": "auto"}
     del settings["photos"]["memory"], settings["train"]["time_limit"]
-    return digest(str(source.resolve()), settings)
+    return digest(os.path.realpath(source), settings)
 
 
 def poses_mark(source: Path, config: MapConfig) -> str:
     """Hash of the input path and the settings that change the poses and the sparse cloud."""
     photos = config.photos
     chosen = (photos.camera, photos.strict, photos.poses, photos.ignore_masks, photos.init_points)
-    return digest(str(source.resolve()), *chosen, config.frame.model_dump(), config.seed)
+    return digest(os.path.realpath(source), *chosen, config.frame.model_dump(), config.seed)
 
 
 def training_mark(source: Path, config: MapConfig) -> str:
@@ -184,13 +187,19 @@ def load_checkpoint(path: Path, mark: str) -> dict[str, Any] | None:
     return state
 
 
+INPUTS = "inputs.json"
+"""Name of the list of input files in a work folder; every run writes it first."""
+OWN = ("*.pt", "masks", "sfm", "poses-*", "block-*", "labels-*", ".*.new-*", ".*.old-*", ".*.lock", INPUTS)
+"""Names of all that a run writes in its work folder."""
 LEAST_DISK = 256 << 20
 """Least free disk space in bytes, as a small run needs it for features, masks, checkpoint and map."""
 
 
 def check_name(output: Path) -> None:
-    """InputError where no map can lie at `output`, as its name is too long."""
+    """InputError where no map can lie at `output`: its name is too long, or it is a link to itself."""
     try:
+        with contextlib.suppress(FileNotFoundError):
+            output.stat()
         work_folder(output).exists()
     except OSError as error:
         raise InputError(f"{output}: no map can lie there ({error.strerror}); choose another -o") from error
@@ -218,15 +227,15 @@ def working(source: Path, output: Path, resume: bool) -> Iterator[Path]:
     with writing(output):
         try:
             yield work
-            shutil.rmtree(work, ignore_errors=True)
+            _remove(work)
         except OSError as error:
             if error.errno != errno.ENOSPC:
                 raise
             raise InputError(f"{work}: the disk is full; free some space and go on with --resume") from error
         except InputError:
             if fresh and not any(work.rglob(CHECKPOINT)):  # also of a block
-                shutil.rmtree(work, ignore_errors=True)
-                if not had_frames:
+                _remove(work)
+                if not had_frames and (frames_folder(output) / FRAMES_RECORD).is_file():
                     shutil.rmtree(frames_folder(output), ignore_errors=True)
             raise
 
@@ -234,7 +243,18 @@ def working(source: Path, output: Path, resume: bool) -> Iterator[Path]:
 def clear_work(output: Path) -> None:
     """Removes the lock and the work folder of a run that was killed after it had written its map."""
     with writing(output):
-        shutil.rmtree(work_folder(output), ignore_errors=True)
+        _remove(work_folder(output))
+
+
+def _remove(work: Path) -> None:
+    """Deletes what a run wrote in its work folder, and the folder unless other files lie there."""
+    if (work / INPUTS).is_file():
+        for file in (file for pattern in OWN for file in work.glob(pattern)):
+            shutil.rmtree(file, ignore_errors=True)
+            with contextlib.suppress(OSError):  # it was a folder
+                file.unlink()
+    with contextlib.suppress(OSError):  # it holds other files, or is not there
+        work.rmdir()
 
 
 def _prepare(source: Path, output: Path, resume: bool) -> Path:

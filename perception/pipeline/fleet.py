@@ -55,7 +55,8 @@ def read_jobs(file: Path) -> list[dict[str, Any]]:
                 raise InputError(f"{where}: has no {key}")
         job = settings_from(Job, given)
         try:
-            source, output = ((file.parent / local_path(text)).resolve() for text in (job.input, job.output))
+            paths = (file.parent / local_path(text) for text in (job.input, job.output))
+            source, output = (Path(os.path.realpath(path)) for path in paths)
             settings = file.parent / local_path(job.config) if job.config else None
         except ValueError as error:  # characters that no path can have, and URLs
             raise InputError(f"{where}: {error}") from error

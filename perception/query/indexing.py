@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.atomic import atomic_file, recover
+from perception.io.atomic import atomic_file, pointed, recover
 from perception.language.encoders import make_encoder
 from perception.map.checksums import FACTS, STORE
 from perception.map.replace import writing
@@ -50,16 +50,16 @@ def index_maps(
     >>> perception.load_map("all.store").query("red mug")[0].map_id == perception.load_map("kitchen.gsmap").map_id
     True
     """
-    encoders = lru_cache(encoders or make_encoder)
+    encoders, store = lru_cache(encoders or make_encoder), pointed(store)
     with writing(store):
         facts = _facts(store)
         entries = {entry["map"]: entry for entry in facts["maps"]}
         counts = dict.fromkeys(("added", "replaced", "unchanged", "removed"), 0)
         for path in remove:
-            if entries.pop(str(path.resolve()), None) is None:
+            if entries.pop(os.path.realpath(path), None) is None:
                 raise InputError(f"{path}: is not one of the {len(entries)} maps in {store}; nothing was removed")
             counts["removed"] += 1
-        paths = list(dict.fromkeys(path.resolve() for path in maps))
+        paths = list(dict.fromkeys(Path(os.path.realpath(path)) for path in maps))
         for path in paths:
             if not (path / FACTS).is_file():
                 raise InputError(f"{path}: is no map (no {FACTS} inside); the store is as it was")

@@ -185,3 +185,15 @@ def test_parts_survive_what_happens_to_others(path: Path) -> None:
     editor.merge([0, 1])
     editor.save()
     assert (read_map(path).parts["ids"] == -1).all() and len(read_map(path).parts["language_embeddings"]) == 0
+
+
+def test_a_map_opened_as_the_working_folder_is_saved_again_and_again(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each save exchanges the folder, so that the working folder is one that is deleted."""
+    monkeypatch.chdir(path)
+    editor = Editor(Path())
+    for name in ("mug", "cup"):
+        editor.rename(0, name)
+        editor.save()
+    assert read_map(path).instances[0]["label"] == "cup"

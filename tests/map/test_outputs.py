@@ -111,3 +111,61 @@ def test_pictures_of_photos_with_one_stem_get_names_of_their_own(place: Path) ->
     (place / "transforms.json").write_text(text.replace("floor.1", "a.jpg").replace("floor.2", "a.png"))
     assert main(["render", "m.gsmap", "-o", "two", "--cameras", "transforms.json"]) == 0
     assert {file.name for file in (place / "two").iterdir()} == {"a.jpg.png", "a.png.png"}
+
+
+def test_what_a_map_was_made_from_is_not_written_over(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Label images are named as the pictures that render writes."""
+    facts = place / "m.gsmap" / "map.json"
+    (place / "labels").mkdir()
+    labels = [place / "labels" / f"{n}.png" for n in (1, 2)]
+    for file in labels:
+        file.write_text("by hand")
+    listed = {
+        f"masks={place / 'labels'}": {"1.png": "7 0", "2.png": "7 0"},
+        f"input={place / 'scan.ply'}": {"scan.ply": "1 0"},
+    }
+    facts.write_text(json.dumps({**json.loads(facts.read_text()), "inputs": listed}))
+    scan = (place / "scan.ply").read_bytes()
+    assert main(["render", "m.gsmap", "-o", "labels"]) == 2
+    assert main(["report", "m.gsmap", "-o", "scan.ply"]) == 2
+    assert "labels/1.png" in capsys.readouterr().err
+    assert [file.read_text() for file in labels] == ["by hand"] * 2 and (place / "scan.ply").read_bytes() == scan
+
+
+@pytest.mark.parametrize("name", ["pipe.ply", "pipe.npy", "pipe.json"])
+def test_a_named_pipe_is_neither_replaced_nor_waited_for(
+    name: str, place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    os.mkfifo(place / name)
+    output = {".npy": "pipe.spz"}.get(Path(name).suffix, "pipe.ply")
+    assert main(["export", "m.gsmap", "-o", output]) == 2
+    assert (place / name).is_fifo()
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("path", ["x" * 300 + ".ply", "loop.ply"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["info", "PATH"],
+        ["upgrade", "m.gsmap", "-o", "PATH"],
+        ["scale", "m.gsmap", "--known-length", "1: 0,0,0 9,9,9", "-o", "PATH"],
+        ["export", "m.gsmap", "--points", "PATH", "-o", "out.ply"],
+        ["export", "m.gsmap", "--points", "scan.ply", "--transform", "PATH", "-o", "out.ply"],
+        ["index", "PATH", "-o", "all"],
+        ["index", "m.gsmap", "--remove", "PATH", "-o", "all"],
+        ["map", "PATH", "-o", "new.gsmap"],
+        ["map", "transforms.json", "-o", "PATH"],
+        ["map", "transforms.json", "-o", "new.gsmap", "--init-points", "PATH"],
+        ["map", "transforms.json", "-o", "new.gsmap", "--masks", "labels:PATH"],
+        ["fleet", "PATH"],
+        ["models", "check", "PATH"],
+    ],
+)
+def test_paths_that_the_system_refuses_are_told_in_one_line(
+    command: list[str], path: str, place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (place / "loop.ply").symlink_to("loop.ply")
+    assert main([word.replace("PATH", path) for word in command]) == 2
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert told.startswith("error: ") and path[:40] in told

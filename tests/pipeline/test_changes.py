@@ -14,7 +14,7 @@ import pytest
 from perception.config import MapConfig, load_config
 from perception.errors import InputError
 from perception.pipeline.changes import hold_inputs, inputs_of, refuse_changed
-from perception.pipeline.checkpoint import frames_folder, work_folder
+from perception.pipeline.checkpoint import clear_work, frames_folder, work_folder, working
 from support.onnx_files import FLOAT, write_onnx
 from support.rgbd_folders import NAMED, write_recording
 
@@ -168,3 +168,19 @@ def test_runs_that_tell_no_input_files_or_damaged_ones_are_refused(tmp_path: Pat
     for found in (None, 3, {"a": 1}, {"a": [[]]}):
         with pytest.raises(InputError, match="damaged"):
             refuse_changed(output, {"inputs": found}, {})
+
+
+def test_only_what_a_run_wrote_is_removed_from_its_folders(tmp_path: Path) -> None:
+    source, output = filled(tmp_path / "in", "1.jpg"), tmp_path / "m.gsmap"
+    work = filled(work_folder(output), "notes.txt")  # of the user, beside a finished map
+    clear_work(output)
+    assert (work / "notes.txt").exists()
+    shutil.rmtree(work)
+    with working(source, output, resume=False):
+        filled(work, "inputs.json", "checkpoint.pt", "masks/1.png", "poses-1/scene.json", "notes.txt")
+    assert [file.name for file in work.iterdir()] == ["notes.txt"]
+    shutil.rmtree(work)
+    with pytest.raises(InputError), working(source, output, resume=False):
+        filled(frames_folder(output), "notes.txt")  # by somebody else meanwhile
+        raise InputError("the frames cannot be written")
+    assert (frames_folder(output) / "notes.txt").exists() and not work.exists()

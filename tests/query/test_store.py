@@ -381,3 +381,9 @@ def test_a_killed_index_leaves_the_old_store_or_the_new_one(maps: list[Path], tm
         assert children.run(lambda place=place: work(place), place).code == 0
         assert answers(place) == whole and sorted(contents(place)) == files
     assert all(state in (before, whole) for state in seen) and seen[0] == before and seen[-1] == whole
+
+
+def test_a_link_to_a_folder_that_is_not_there_yet_becomes_a_store_there(maps: list[Path], tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to("there")
+    assert index_maps(tmp_path / "link", maps[1:2], encoders=encoders)["added"] == 1
+    assert (tmp_path / "there" / "store.json").is_file() and (tmp_path / "link").is_symlink()
