@@ -113,7 +113,7 @@ def source(gmap: QueryMap, frame: Frame | None = None) -> dict[str, Any]:
 class Request:
     """One prompt with its filters; its coordinates and those of the reply are in `frame`, None = the map's.
 
-    InputError for an empty or overlong text, and for numbers out of range.
+    InputError for a text that is empty, overlong or no Unicode, and for numbers out of range.
 
     >>> Request("red mug", top_k=1, where=Where(max_size=0.6)).text
     'red mug'
@@ -128,6 +128,8 @@ class Request:
     def __post_init__(self) -> None:
         if not isinstance(self.text, str):
             raise InputError(f"query: the text is {type(self.text).__name__}, expected a text")
+        if any("\ud800" <= letter <= "\udfff" for letter in self.text):
+            raise InputError("query: the text holds bytes that are no UTF-8, or half of a surrogate pair; mend it")
         if not self.text.strip():
             raise InputError('query: the text is empty; ask for a thing, such as "red mug"')
         if len(self.text) > MAX_TEXT:
