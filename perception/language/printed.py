@@ -8,8 +8,10 @@ of it (Sellers 1980); characters that OCR confuses (0 and O, 1 and l) are equal.
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Sequence
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -68,10 +70,19 @@ class Printed:
 
     def __init__(self, texts: Sequence[Sequence[dict[str, Any]]], groups: np.ndarray | None = None) -> None:
         self.count, self._groups = len(texts), np.zeros(len(texts), int) if groups is None else groups
-        self._lines = [(i, tuple(_folded(e["text"])), float(e["score"])) for i, es in enumerate(texts) for e in es]
+        entries = [(i, tuple(_folded(e["text"])), float(e["score"])) for i, es in enumerate(texts) for e in es]
+        entries = [entry for entry in entries if entry[1]]
+        lines = sorted({line for _, line, _ in entries}, key=lambda line: sum(map(len, line)))
+        number = {line: n for n, line in enumerate(lines)}
+        self._owners = np.array([i for i, _, _ in entries], int)
+        self._scores = np.array([score for _, _, score in entries], float)
+        self._lines = np.array([number[line] for _, line, _ in entries], int)
+        self._words, self._joined = Texts({word for line in lines for word in line}), Texts(map("".join, lines))
+        self._words_of = np.array([self._words.number[word] for line in lines for word in line], int)
+        self._starts = np.cumsum([0, *(len(line) for line in lines)])[:-1]
 
     def __bool__(self) -> bool:
-        return bool(self._lines)
+        return bool(len(self._lines))
 
     def quoted(self, text: str) -> np.ndarray:
         """[I] in [0, 1]: how well each instance bears `text`: as a whole, or its words, weighted by their lengths."""
@@ -87,33 +98,78 @@ class Printed:
         return share if len(telling) == 1 == len(words) or _KIND.get(head_noun(prompt)) == "carrier" else share**2
 
     def _borne(self, words: Sequence[str], weights: Sequence[float]) -> np.ndarray:
-        best, most = np.zeros((len(words), self.count)), np.full((len(words), self._groups.max(initial=0) + 1), 1e-9)
-        different = {line for _, line, _ in self._lines}
-        for n, word in enumerate(words):
-            quality = {line: match_quality(word, line) for line in different}
-            for i, line, score in self._lines:
-                best[n, i] = max(best[n, i], score * quality[line])
-                most[n, self._groups[i]] = max(most[n, self._groups[i]], best[n, i])
-        best *= (best / most[:, self._groups]) ** RIVAL
-        return np.asarray(weights, np.float64) @ best / max(sum(weights), 1)
+        weight_of: dict[str, float] = {}
+        for word, weight in zip(words, weights, strict=True):
+            weight_of[word] = weight_of.get(word, 0.0) + weight
+        total = np.zeros(self.count)
+        for word, weight in weight_of.items():
+            quality = self._qualities(word) if len(self._lines) else self._scores
+            if quality.any():
+                best, most = np.zeros(self.count), np.full(self._groups.max(initial=0) + 1, 1e-9)
+                np.maximum.at(best, self._owners, self._scores * quality[self._lines])
+                np.maximum.at(most, self._groups, best)
+                total += weight * best * (best / most[self._groups]) ** RIVAL
+        return total / max(sum(weights), 1)
+
+    def _qualities(self, word: str) -> np.ndarray:
+        """Quality in {0} ∪ [PART, 1] of the best match of a folded word with each of the lines."""
+        texts, size = self._words, len(word)
+        quality = np.zeros(len(texts.number))
+        if size > SHORT:
+            nearest, distance = texts.distances(word, max(SHORT + 1, QUALITY * size), (2 - QUALITY) * size)
+            quality[nearest] = _quality(distance, size)
+            within = range(max(SHORT + 1, math.ceil(PART * size)), math.ceil(QUALITY * size))
+            for length in texts.lengths.intersection(within):
+                parts = {word[at : at + length] for at in range(size - length + 1)}
+                quality[[texts.number[part] for part in parts & texts.number.keys()]] = length / size
+            run_together = texts.at_an_end(word)  # with the word before or after it
+            quality[run_together] = np.maximum(quality[run_together], QUALITY)
+        if word in texts.number:
+            quality[texts.number[word]] = 1.0
+        of_lines = np.maximum.reduceat(quality[self._words_of], self._starts)
+        if size >= LONG:  # a shorter text lacks too many characters
+            nearest, distance = self._joined.distances(word, QUALITY * size, inside=True)
+            of_lines[nearest] = np.maximum(of_lines[nearest], _quality(distance, size))
+        return of_lines
 
 
-def match_quality(word: str, line: Sequence[str]) -> float:
-    """Quality in {0} ∪ [PART, 1] of the best match of a folded word with the folded words of a line."""
-    best = 0.0
-    for other in line:
-        if word == other:
-            return 1.0
-        if len(word) > SHORT and (other.startswith(word) or other.endswith(word)):
-            best = max(best, QUALITY)  # run together with the next word
-        if SHORT < len(other) < len(word) and other in word:
-            best = max(best, len(other) / len(word) * (len(other) >= PART * len(word)))
-        elif min(len(word), len(other)) > SHORT:
-            best = max(best, _quality(edit_distance(word, other), len(word)))
-    joined = "".join(line)
-    if len(word) >= LONG and len(joined) >= QUALITY * len(word):  # a shorter text lacks too many characters
-        best = max(best, _quality(edit_distance(word, joined, inside=True), len(word)))
-    return best
+class Texts:
+    """Many texts, shortest first, that are compared with a word all at once."""
+
+    def __init__(self, texts: Iterable[str]) -> None:
+        ordered = sorted(texts, key=len)
+        self.number = {text: n for n, text in enumerate(ordered)}
+        self._sizes = [len(text) for text in ordered]
+        self.lengths = set(self._sizes)
+        self._text = "\0".join(["", *ordered, ""])
+        self._codes = np.frombuffer(self._text.encode("utf-32-le", "surrogatepass"), np.uint32)
+        self._starts = np.cumsum([0, *(size + 1 for size in self._sizes)])  # each with the 0 before it
+
+    def distances(
+        self, word: str, least: float, most: float = math.inf, inside: bool = False
+    ) -> tuple[slice, np.ndarray]:
+        """Which texts have `least` to `most` characters, and of each `edit_distance(word, text, inside)`."""
+        some = slice(bisect_left(self._sizes, least), bisect_right(self._sizes, most))
+        starts = self._starts[some.start : max(some.start, some.stop) + 1]
+        if len(starts) < 2:
+            return slice(0), np.zeros(0, int)
+        codes, firsts, sizes = self._codes[starts[0] : starts[-1]], starts[:-1] - starts[0], np.diff(starts)
+        slope = np.arange(len(codes)) + np.repeat(np.arange(len(sizes)) * (len(word) + int(sizes.max())), sizes)
+        row = np.zeros(len(codes), int) if inside else np.arange(len(codes)) - np.repeat(firsts, sizes)
+        for n, letter in enumerate(word, start=1):
+            after = row + 1
+            np.minimum(after[1:], row[:-1] + (codes[1:] != ord(letter)), out=after[1:])
+            after[firsts] = n
+            after -= slope  # so that the least up to a cell counts one more per cell, and none of another text
+            row = np.minimum.accumulate(after, out=after)
+            row += slope
+        return some, np.minimum.reduceat(row, firsts) if inside else row[firsts + sizes - 1]
+
+    def at_an_end(self, word: str) -> np.ndarray:
+        """The numbers of the texts that begin or end with the word."""
+        ends = re.compile(f"\0{re.escape(word)}|{re.escape(word)}(?=\0)")
+        found = [match.end() - 1 for match in ends.finditer(self._text)]
+        return np.searchsorted(self._starts, np.array(found, int), side="right") - 1
 
 
 def edit_distance(a: str, b: str, inside: bool = False) -> int:
@@ -126,9 +182,9 @@ def edit_distance(a: str, b: str, inside: bool = False) -> int:
     return min(row) if inside else row[-1]
 
 
-def _quality(distance: int, length: int) -> float:
+def _quality(distance: np.ndarray, length: int) -> np.ndarray:
     quality = 1.0 - distance / length
-    return quality if quality >= QUALITY else 0.0
+    return np.where(quality >= QUALITY, quality, 0.0)
 
 
 def _folded(text: str) -> list[str]:

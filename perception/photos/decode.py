@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import threading
 import warnings
 from collections.abc import MutableMapping
@@ -28,6 +29,9 @@ MOST_DECODED = 400_000_000
 _DENSEST = 8 * 1032
 """Most pixels that a byte of a file in one of _BOUNDED can hold: deflate's densest code, at one bit a pixel."""
 _BOUNDED = ("PNG", "JPEG", "MPO", "BMP", "GIF")
+_PNG_END = b"IEND\xaeB`\x82"
+_REDUCED = ("JPEG", "MPO")
+"""Formats that are decoded at a reduced size."""
 # These libraries report damaged files on the standard error; here an InputError does.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 warnings.filterwarnings("ignore", category=UserWarning, module="PIL")
@@ -216,7 +220,10 @@ def open_photo(path: Path) -> Image.Image:
             raise ValueError("no file")  # to open a FIFO would mean to wait for its writer
         with path.open("rb") as file:
             file.read(_HEADER)  # on a disk that hangs, this waits, without the lock that other photos need
-        return _open(path)
+        image = _open(path)
+        most = math.inf if image.format in _REDUCED else None  # that of these is checked when it is known
+        check_size(path, image.size, image.format, path.stat().st_size, most)
+        return image
 
 
 def _open(source: Path | io.BytesIO) -> Image.Image:
@@ -235,11 +242,11 @@ def decode(image: Image.Image, path: Path) -> None:
         image.load()
 
 
-def check_size(where: object, size: tuple[int, int], kind: str | None, held: int) -> None:
-    """InputError for a header that claims more than MOST_DECODED pixels, or more than `held` bytes of that format can
-    hold: before memory is taken for them."""
+def check_size(where: object, size: tuple[int, int], kind: str | None, held: int, most: float | None = None) -> None:
+    """InputError for a header that claims more than `most` pixels (None: MOST_DECODED), or more than `held` bytes of
+    that format can hold: before memory is taken for them."""
     width, height = size
-    if width * height > MOST_DECODED:
+    if width * height > (MOST_DECODED if most is None else most):
         raise InputError(f"{where}: {width}×{height} pixels, at most {MOST_DECODED} are read; shrink it")
     if kind in _BOUNDED and width * height > _DENSEST * held:
         raise InputError(f"{where}: {held} bytes cannot hold {width}×{height} pixels; the picture is damaged")
@@ -265,6 +272,8 @@ def _claims(data: bytes) -> tuple[tuple[int, int], str | None]:
         with _open(io.BytesIO(data)) as image:
             size, kind = image.size, image.format
             image.verify()
+            if kind == "PNG" and _PNG_END not in data:
+                raise ValueError("cut short")  # libpng would say so on the standard error
             return size, kind
     except UnidentifiedImageError:  # a TIFF of numbers that Pillow has no mode for, such as float64
         tags = TiffImagePlugin.ImageFileDirectory_v2(data[:8])

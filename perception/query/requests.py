@@ -21,6 +21,8 @@ def check_prompt(text: Any, top_k: Any = TOP, min_score: Any = None) -> None:
     """InputError unless `text` is a text that is neither empty nor too long, and the numbers are in their range."""
     if not isinstance(text, str):
         raise InputError(f"query: the text is {type(text).__name__}, expected a text")
+    if any("\ud800" <= letter <= "\udfff" for letter in text):
+        raise InputError("query: the text holds bytes that are no UTF-8, or half of a surrogate pair; mend it")
     if not text.strip():
         raise InputError('query: the text is empty; ask for a thing, such as "red mug"')
     if len(text) > MAX_TEXT:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -98,6 +99,53 @@ def test_a_quoted_text_is_also_matched_as_a_whole() -> None:
 def test_evidence_by_hand(prompt: str, text: str, least: float, most: float) -> None:
     found = Printed([[], _on("unlike", text)]).evidence(prompt)
     assert found[0] == 0 and least - 1e-9 <= found[1] <= most + 1e-9
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_words_match_as_the_rules_say_one_by_one(seed: int) -> None:
+    """All texts at once are compared as the rules above compare one, with the distances of the recursion."""
+    rng = np.random.default_rng(seed)
+    for _ in range(15):
+        word, *lines = ("".join(rng.choice(list("abc"), rng.integers(1, 10))) for _ in range(6))
+        best = np.array([_quality_by_rule(word, line) for line in lines])
+        found = Printed([_on(line) for line in lines]).quoted(word)
+        assert found == pytest.approx(best * (best / max(best.max(), 1e-9)) ** 4)
+
+
+def _quality_by_rule(word: str, other: str) -> float:
+    if word == other:
+        return 1.0
+    stretches = [other[i:j] for i in range(len(other) + 1) for j in range(i, len(other) + 1)]
+    least = min(_brute(word, stretch) for stretch in stretches) if len(word) > 4 else len(word)
+    if min(len(word), len(other)) > 3:
+        least = min(least, _brute(word, other))
+    near = 1 - least / len(word)
+    inside = len(other) / len(word) if 3 < len(other) < len(word) and other in word else 0.0
+    ends = len(word) > 3 and (other.startswith(word) or other.endswith(word))
+    return max(near * (near >= 0.75), inside * (inside >= 0.6), 0.75 * ends)
+
+
+@pytest.mark.parametrize("size", [3, 6, 60, 900])
+def test_what_is_printed_in_a_large_map_costs_no_line_of_python_for_each_character(size: int) -> None:
+    rng = np.random.default_rng(size)
+
+    def words(count: int) -> str:
+        return " ".join("".join(rng.choice(list("abcdefghjk"), size)) for _ in range(count // (size + 1) + 1))
+
+    printed, prompt, lines = Printed([_on(words(100)) for _ in range(200)]), words(900)[:1000], 0
+
+    def trace(*_: object) -> Callable[..., object]:
+        nonlocal lines
+        lines += 1
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        printed.quoted(prompt), printed.evidence(prompt)
+    finally:
+        sys.settrace(before)
+    assert lines < 1_000_000  # 20,000 characters are printed: each with each of the prompt would be 2 · 10^7
 
 
 def test_quoted_words_weigh_by_length_and_read_score() -> None:

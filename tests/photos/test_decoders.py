@@ -24,7 +24,8 @@ from perception.evaluate.images import read_rgb
 from perception.io.arrays import map_npy, read_npz
 from perception.masks.label_files import read_labels, stored_key
 from perception.onnx.sessions import open_session, side_files
-from perception.photos.decode import read_photo, why_left_out
+from perception.photos import decode
+from perception.photos.decode import photo_size, read_photo, why_left_out
 from perception.photos.depth import read_depth
 from perception.photos.ignore_masks import read_mask
 
@@ -94,6 +95,38 @@ def test_a_header_takes_no_memory_for_what_the_file_does_not_hold(
     refused(READERS[reader], file, match=re.escape(file.name))
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50 << 10  # KiB
     assert why_left_out(file) is not None and stored_key(file) is None
+
+
+def test_a_progressive_jpeg_takes_no_memory_for_what_it_does_not_hold(tmp_path: Path) -> None:
+    """libjpeg keeps the coefficients of a whole one, also where it is decoded at an eighth of its size."""
+    import resource
+
+    held = io.BytesIO()
+    Image.new("RGB", (8, 6), "red").save(held, "JPEG", progressive=True)
+    content = bytearray(held.getvalue())
+    struct.pack_into(">HH", content, content.index(b"\xff\xc2") + 5, 19000, 19000)
+    file = tmp_path / "a.jpg"
+    file.write_bytes(content)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert "cannot hold" in str(why_left_out(file))
+    refused(photo_size, file, match="cannot hold")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50 << 10  # KiB
+
+
+def test_the_size_of_a_picture_too_large_to_be_read_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pillow decodes a whole PNG in search of EXIF data behind the pixels."""
+    monkeypatch.setattr(decode, "MOST_DECODED", 100)
+    Image.new("L", (8, 6)).save(tmp_path / "a.png")
+    assert photo_size(tmp_path / "a.png") == (8, 6)
+    Image.new("L", (20, 6)).save(tmp_path / "a.png")
+    refused(photo_size, tmp_path / "a.png", match="at most 100")
+
+
+def test_a_png_without_its_end_is_refused_in_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    Image.new("L", (20, 6)).save(tmp_path / "a.png")
+    (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:-3])
+    refused(read_depth, tmp_path / "a.png", match="not a readable")
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize("reader", READERS)

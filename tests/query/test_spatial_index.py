@@ -204,6 +204,7 @@ def test_a_description_names_neighbours_by_their_gap(gmap: QueryMap, arrays: Map
         lambda g: g.describe(-1),
         lambda g: g.query(" "),
         lambda g: g.query("x" * 1_000_000),
+        lambda g: g.query("mug \udcff"),  # as an argument of a command with a byte that is no UTF-8
         lambda g: g.query("mug", top_k=0),
         lambda g: g.query("mug", top_k=1.5),
         lambda g: g.query("mug", min_score=float("nan")),
