@@ -13,7 +13,7 @@ from PIL import Image
 from perception.errors import InputError
 from perception.inputs.load import load_scene
 from perception.photos.folder import list_photos
-from perception.photos.video import frame_size, video_frames
+from perception.photos.video import FRAMES_RECORD, frame_size, video_frames
 from perception.pipeline.checkpoint import frames_folder, working
 from perception.sfm.options import ReadOptions
 from support.progress import Told
@@ -100,5 +100,6 @@ def test_a_refused_run_leaves_only_frames_that_were_there(tmp_path: Path, earlie
         frames_folder(output).mkdir()
     with pytest.raises(InputError, match="later"), working(video, output, resume=False):
         frames_folder(output).mkdir(exist_ok=True)
+        (frames_folder(output) / FRAMES_RECORD).write_text("{}")  # as a run writes it
         raise InputError("found later")
     assert {path.name for path in tmp_path.iterdir()} == {"v.mp4", *(["v.gsmap.frames"] if earlier else [])}
