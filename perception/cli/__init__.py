@@ -70,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:  # a path that the system refuses, wherever it is used first
         if error.filename is None or error.strerror is None:
             raise
-        told = InputError(f"{error.filename}: {error.strerror}; give another path, or allow access to this one")
-        print(f"error: {' '.join(str(told).split())}", file=sys.stderr)
+        line = InputError(f"{error.filename}: {error.strerror}; give another path, or allow access to this one")
+        print(f"error: {' '.join(str(line).split())}", file=sys.stderr)
         return 2
     return 0

@@ -40,8 +40,8 @@ def register(commands: Any) -> None:
 
 
 def _add_photos(command: Any) -> None:
-    told = "also show photos in this folder; else only those in the map's own: a map from others may name any file"
-    command.add_argument("--photos", type=_folder, metavar="DIR", help=told)
+    text = "also show photos in this folder; else only those in the map's own: a map from others may name any file"
+    command.add_argument("--photos", type=_folder, metavar="DIR", help=text)
 
 
 def _folder(text: str) -> Path:

@@ -48,12 +48,12 @@ _WORD, _LETTER = re.compile(r"\w+"), re.compile(r"\w")
 def quoted_text(prompt: str) -> tuple[str, str] | None:
     """(thing, text) of a prompt that quotes what is printed: "the book that says BIRDS" → ("the book", "BIRDS")."""
     prompt = " ".join(prompt.split())
-    said = found_after_a_word(_SAYS, prompt)
-    thing, text = (prompt[: said.start()].rstrip(", "), prompt[said.end() :]) if said else (prompt, "")
+    verb = found_after_a_word(_SAYS, prompt)
+    thing, text = (prompt[: verb.start()].rstrip(", "), prompt[verb.end() :]) if verb else (prompt, "")
     if quote := _QUOTED.search(prompt):
-        thing, text = (thing if said else _QUOTED.sub(" ", prompt)), quote[1]
+        thing, text = (thing if verb else _QUOTED.sub(" ", prompt)), quote[1]
     words = [word for word in _WORD.findall(thing.lower()) if _KIND.get(word) != "article"]
-    if not text or (said and not quote and not words):
+    if not text or (verb and not quote and not words):
         return None
     return " ".join(thing.split()) if words else "thing", text.strip(" .,;:!?'")
 
