@@ -24,11 +24,11 @@ def register(commands: Any) -> None:
     p.add_argument("--remove", type=Path, action="append", default=[], metavar="MAP", help="take it out of the store")
     p = map_command(commands, "export", _export, "instances onto a point cloud or mesh, or onto the map's own points")
     p.add_argument("--points", type=Path, metavar="CLOUD")
-    place = p.add_mutually_exclusive_group()
-    place.add_argument(
+    frame = p.add_mutually_exclusive_group()
+    frame.add_argument(
         "--align", action="store_true", help="the cloud lies in a frame of its own: register it, or refuse"
     )
-    place.add_argument(
+    frame.add_argument(
         "--transform", type=Path, metavar="FILE", help="as --align, by a known 4 x 4 map_from_scan (text or JSON)"
     )
     p.add_argument("-o", "--output", type=Path, metavar="OUT", help=".ply, .pcd or .npz; .spz: Gaussians")

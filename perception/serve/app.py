@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
@@ -64,16 +65,35 @@ def build_app(engine: QueryEngine, settings: ServeSettings) -> FastAPI:
         exception_handlers=HANDLERS,
     )
     app.add_middleware(HttpGuard, settings=settings)
+    add_state(app, engine)
+    add_searches(app, MapQueries(engine))
+    add_instances(app, MapQueries(engine))
+    return app
 
-    async def answered(map_id: str | None, work: Callable[[QueryMap], T]) -> T:
-        """The result of `work` in the engine, on the map with this id if one is given."""
-        return await engine.awaited(engine.run(work, map_id=map_id))
 
-    async def hits(map_id: str | None, frame: Frame | None, work: Callable[[QueryMap], Sequence[Hit]]) -> Response:
+@dataclass(frozen=True)
+class MapQueries:
+    """Runs queries in the engine, on the map with the id `map_id` if one is given."""
+
+    engine: QueryEngine
+
+    async def result(self, map_id: str | None, work: Callable[[QueryMap], T]) -> T:
+        """What `work` returns."""
+        return await self.engine.awaited(self.engine.run(work, map_id=map_id))
+
+    async def hits(
+        self, map_id: str | None, frame: Frame | None, work: Callable[[QueryMap], Sequence[Hit]]
+    ) -> Response:
+        """The hits that `work` finds, in `frame`."""
+
         def answer(gmap: QueryMap) -> dict[str, Any]:
             return {"hits": [hit.to_json() for hit in work(gmap)], **source(gmap, frame)}
 
-        return JSONResponse(await answered(map_id, answer))
+        return JSONResponse(await self.result(map_id, answer))
+
+
+def add_state(app: FastAPI, engine: QueryEngine) -> None:
+    """The routes of the server's state."""
 
     @app.get("/health")
     async def health(request: Request) -> Response:
@@ -81,6 +101,16 @@ def build_app(engine: QueryEngine, settings: ServeSettings) -> FastAPI:
         health = engine.health()
         shown = health if request.state.trusted else {"status": health["status"]}
         return JSONResponse(shown, 200 if health["status"] != "closed" else 503)
+
+    @app.post("/reload")
+    async def reload() -> Response:
+        """Takes over the map that lies on disk now."""
+        changed = await run_in_threadpool(engine.reload)
+        return JSONResponse({"changed": changed, "map_id": engine.current.map_id})
+
+
+def add_searches(app: FastAPI, queries: MapQueries) -> None:
+    """The routes that search for instances."""
 
     @app.post("/query")
     async def query(body: QueryBody, map_id: MapId = None) -> Response:
@@ -91,19 +121,21 @@ def build_app(engine: QueryEngine, settings: ServeSettings) -> FastAPI:
             results = [request.answered(gmap, time.monotonic()).to_json() for request in requests]
             return {"results": results, **source(gmap, requests[0].frame)}
 
-        return JSONResponse(await answered(map_id, work))
+        return JSONResponse(await queries.result(map_id, work))
 
     @app.post("/find")
     async def find(body: FindBody, map_id: MapId = None) -> Response:
         """All instances that fulfil a filter."""
         where, frame = body.query_where(), body.query_frame()
-        return await hits(map_id, frame, lambda gmap: gmap.find(where, frame=frame))
+        return await queries.hits(map_id, frame, lambda gmap: gmap.find(where, frame=frame))
 
     @app.post("/nearest")
     async def nearest(body: NearestBody, map_id: MapId = None) -> Response:
         """The instances nearest to a point or pose."""
         where, frame, near = body.query_where(), body.query_frame(), np.array(body.near)
-        return await hits(map_id, frame, lambda gmap: gmap.nearest(near, body.top_k or 1, where=where, frame=frame))
+        return await queries.hits(
+            map_id, frame, lambda gmap: gmap.nearest(near, body.top_k or 1, where=where, frame=frame)
+        )
 
     @app.post("/at")
     async def at(body: AtBody, map_id: MapId = None) -> Response:
@@ -114,30 +146,26 @@ def build_app(engine: QueryEngine, settings: ServeSettings) -> FastAPI:
             hit = gmap.instance_at(np.array(body.point), max_distance=body.max_distance, frame=frame)
             return [] if hit is None else [hit]
 
-        return await hits(map_id, frame, work)
+        return await queries.hits(map_id, frame, work)
 
-    @app.post("/reload")
-    async def reload() -> Response:
-        """Takes over the map that lies on disk now."""
-        changed = await run_in_threadpool(engine.reload)
-        return JSONResponse({"changed": changed, "map_id": engine.current.map_id})
+
+def add_instances(app: FastAPI, queries: MapQueries) -> None:
+    """The routes of the map's instances."""
 
     @app.get("/instances")
     async def instances(map_id: MapId = None) -> Response:
         """All instances."""
-        return await hits(map_id, None, lambda gmap: gmap.find())
+        return await queries.hits(map_id, None, lambda gmap: gmap.find())
 
     @app.get("/instances/{id}")
     async def describe(number: Id, map_id: MapId = None) -> Response:
         """One instance."""
-        answer = await answered(map_id, lambda gmap: {**gmap.describe(number).to_json(), **source(gmap)})
+        answer = await queries.result(map_id, lambda gmap: {**gmap.describe(number).to_json(), **source(gmap)})
         return JSONResponse(answer)
 
     @app.get("/instances/{id}/points", response_class=Response)
     async def points(number: Id, map_id: MapId = None, format: Literal["npz", "ply"] = "npz") -> Response:
         """The instance's points, float32, in the map's frame; the header X-Map-Id names the map."""
-        made_by, data = await answered(map_id, lambda gmap: (gmap.map_id, encode(gmap, number, format)))
+        made_by, data = await queries.result(map_id, lambda gmap: (gmap.map_id, encode(gmap, number, format)))
         name = f'attachment; filename="instance_{number}.{format}"'
         return Response(data, media_type=FORMATS[format], headers={"X-Map-Id": made_by, "Content-Disposition": name})
-
-    return app
