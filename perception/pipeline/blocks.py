@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -136,15 +137,20 @@ def _divided(
     ]
 
 
-def optimise_scene(run: Run, scene: Scene, training: list[View], held_out: list[View], source: MaskSource) -> Optimised:
-    """`optimise` for a scene of one block. Of a larger one, trains all blocks, joins them, and labels all photos.
+def optimiser(scene: Scene, most: int) -> Callable[[Run, Scene, list[View], list[View], MaskSource], Optimised]:
+    """`optimise` for a scene that is trained in one piece, `optimise_blocks` for a larger one. most: see `cut`."""
+    blocks = cut(scene, most)
+    return optimise if len(blocks) == 1 else partial(optimise_blocks, blocks)
+
+
+def optimise_blocks(
+    blocks: list[Block], run: Run, scene: Scene, training: list[View], held_out: list[View], source: MaskSource
+) -> Optimised:
+    """Trains all blocks, joins their Gaussians, and labels all photos.
 
     Each block is a task of the engine, in its own folder below `run.work`. A task that is finished is not run again.
     A block makes masks of its own where they need depth; others are made once per photo.
     """
-    blocks = cut(scene, run.config.train.block_photos)
-    if len(blocks) == 1:
-        return optimise(run, scene, training, held_out, source)
     label_by_tasks(run, training, source)
     held = {view.name for view in held_out}
     folders = [_task(run, scene, block, held, source.needs_depth) for block in blocks]

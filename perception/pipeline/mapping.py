@@ -27,7 +27,7 @@ from perception.masks import MaskSource, make_source
 from perception.masks.compute import load_segmentation
 from perception.photos.scene_file import load_saved_scene, save_scene
 from perception.photos.view_json import stored_view
-from perception.pipeline.blocks import optimise_scene
+from perception.pipeline.blocks import optimiser
 from perception.pipeline.changes import hold_inputs, inputs_of, refuse_changed
 from perception.pipeline.checkpoint import check_name, clear_work, fingerprint, frames_folder, poses_mark, working
 from perception.pipeline.estimate import log_estimate
@@ -74,7 +74,7 @@ def build_map(
         scene, training, held_out = split_scene(scene, config.photos)
 
         # Masks M_v,i of every photo (§3.2), and Gaussians optimised on photos and masks (§3.1 to 3.2.3).
-        optimised = optimise_scene(run, scene, training, held_out, masks)
+        optimised = optimiser(scene, config.train.block_photos)(run, scene, training, held_out, masks)
         segments = load_segmentation(run.masks) if masks.needs_depth else None
         del masks  # with its images
 

@@ -140,7 +140,7 @@ def test_the_shipped_scene_is_the_one_that_is_made() -> None:
         photo = image(SCENE / "photos" / name)[..., ::-1].astype(np.float64)
         error = photo - cast(made.bodies, made.lighting.lamps[0], cameras[i]).rgb
         assert np.sqrt(np.square(error).mean()) < 6  # 4.4: noise of 1.6 levels, and JPEG with half the colours
-    assert truth.asked == made.asked
+    assert truth.prompts == made.asked
     assert truth.instances == {number: body.name for number, body in enumerate(made.bodies, start=1)}
     assert set(truth.instance_ids.tolist()) <= set(truth.instances)
 

@@ -22,7 +22,7 @@ from perception.gaussians.train import Trainer
 from perception.map.replace import lock_file, writing
 from perception.map.write import read_map, set_labels, verify_map, write_map
 from perception.pipeline import mapping
-from perception.pipeline.checkpoint import CHECKPOINT, load_checkpoint, save_checkpoint, work_folder
+from perception.pipeline.checkpoint import CHECKPOINT, INPUTS, load_checkpoint, save_checkpoint, work_folder
 from perception.pipeline.mapping import build_map
 from support.paths import SUPPORT
 from support.query_maps import write_map_of
@@ -265,6 +265,7 @@ def test_resuming_a_finished_run_tidies_up_and_changes_nothing(small_scene: Path
     before = {path.name: path.read_bytes() for path in out.iterdir()}
     work_folder(out).mkdir()
     (work_folder(out) / CHECKPOINT).touch()
+    (work_folder(out) / INPUTS).touch()
     build_map(source, out, config(small_scene), resume=True)
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before and not work_folder(out).exists()
     for other in (config(small_scene, "seed=1"), config(small_scene, "train.budget=3000")):

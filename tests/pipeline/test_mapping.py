@@ -207,7 +207,7 @@ def test_built_in_masks_are_made_from_the_maps_own_depth(small_scene: Path, tmp_
         ("nan", "pose"),
         ("label_size", "labels"),
         ("label_missing", "labels"),
-        ("photo", "truncated"),
+        ("photo", "damaged or cut short"),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(

@@ -103,6 +103,6 @@ def test_a_video_becomes_a_map(
     assert main(["map", str(video), "-o", str(out), *[f"--set={s}" for s in SETTINGS]]) == 0
     gmap = read_map(out)
     assert len(gmap.views) >= 0.6 * VIEWS
-    assert {view.photo.resolve().parent for view in gmap.located_views()} == {tmp_path / "kitchen.frames"}
-    assert "kitchen.frames" in capsys.readouterr().err
+    assert {view.photo.resolve().parent for view in gmap.located_views()} == {tmp_path / "kitchen.gsmap.frames"}
+    assert "kitchen.gsmap.frames" in capsys.readouterr().err
     assert not (tmp_path / "kitchen.gsmap.work").exists()

@@ -180,7 +180,7 @@ def test_changed_frames_of_a_video_are_refused(tmp_path: Path, monkeypatch: pyte
     video, out = tmp_path / "v.mp4", tmp_path / "m.gsmap"
     video.write_bytes(b"x")
     monkeypatch.setattr(mapping, "load_scene", load_scene)
-    monkeypatch.setattr(mapping, "placed_scene", lambda scene, *_: scene)
+    monkeypatch.setattr(mapping, "in_world_frame", lambda scene, *_: scene)
     monkeypatch.setattr(mapping, "recentred", lambda scene: scene)
     monkeypatch.setattr(mapping, "log_estimate", lambda *_: None)
     monkeypatch.setattr(mapping, "_tell_scene", stop)
