@@ -183,7 +183,7 @@ def test_changed_frames_of_a_video_are_refused(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(mapping, "in_world_frame", lambda scene, *_: scene)
     monkeypatch.setattr(mapping, "recentred", lambda scene: scene)
     monkeypatch.setattr(mapping, "log_estimate", lambda *_: None)
-    monkeypatch.setattr(mapping, "_tell_scene", stop)
+    monkeypatch.setattr(mapping, "split_scene", stop)
     config = load_config(None, [*SETTINGS, "masks=builtin"])
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
