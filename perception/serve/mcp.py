@@ -297,6 +297,8 @@ def make_server(engine: QueryEngine, photos: Path | None = None) -> Server[Any]:
             content.append(types.ImageContent(data=base64.b64encode(jpeg).decode(), mime_type="image/jpeg"))
         return types.CallToolResult(content=content, structured_content=result, is_error="error" in result)
 
+    import perception.export.render  # noqa: F401  # torch, here and not within the time of the first answer
+
     for learn in (_names, _relations):  # which may take longer than an answer
         learn(engine.current)
         engine.on_reload(learn)
