@@ -14,7 +14,7 @@ import numpy as np
 
 from perception.config import InstanceConfig
 from perception.geometry import sums_by
-from perception.instances.assign import memberships, reassign
+from perception.instances.assign import LEAST_AGREEMENT, memberships, reassign
 from perception.instances.cluster import MIN_OPACITY, by_falling_size, cluster_gaussians
 from perception.instances.confidence import calibrated, raw_scores
 from perception.instances.consensus import best_cut, dendrogram, evidence, node_evidence, parts_of
@@ -25,6 +25,7 @@ from perception.machine import return_free_memory
 PER_SEGMENT = 16  # Gaussians; smaller segments have too little evidence in the photos
 LEAST_SEGMENTS, MAX_SEGMENTS = 32, 1000
 PER_SEGMENT_BEYOND = 300  # Gaussians of a segment in maps where that makes more than MAX_SEGMENTS: bounds the time
+ROUNDS = 3  # in which Gaussians that disagree with their segment leave it
 LEAST = 4  # Gaussians; smaller groups are dropped even if masks support them
 LEAST_OF_MEDIAN = 0.25  # size of a group that no photo supports, relative to the median
 
@@ -93,7 +94,8 @@ def _by_consensus(
         return ids, parts, np.zeros(0, np.int64)
     most = max(MAX_SEGMENTS, len(solid) // PER_SEGMENT_BEYOND)
     wanted = int(np.clip(len(solid) // PER_SEGMENT, min(LEAST_SEGMENTS, len(solid)), most))
-    segments = over_segment(means[solid], features[solid], wanted, seed)
+    segment_of[solid] = over_segment(means[solid], features[solid], wanted, seed)
+    segments = np.unique(_parted_by_masks(segment_of, means, features, votes, seed)[solid], return_inverse=True)[1]
     segment_of[solid] = segments
     sizes = np.bincount(segments)
     segment_votes = votes.of_groups(segment_of, len(sizes))
@@ -110,6 +112,24 @@ def _by_consensus(
             parents.append(number)
     ids[solid], parts[solid] = instance[segments], part[segments]
     return ids, parts, np.array(parents, np.int64)
+
+
+def _parted_by_masks(
+    segment_of: np.ndarray, means: np.ndarray, features: np.ndarray, votes: MaskVotes, seed: int
+) -> np.ndarray:
+    """segment_of [N] (−1 = none), where Gaussians whose masks disagree with their segment form segments of their own.
+
+    A coin on a table has so few Gaussians that the table's segments take them in. ROUNDS times, those that are left
+    over are cut anew, each time into smaller segments.
+    """
+    for size in (PER_SEGMENT >> n for n in range(ROUNDS)):
+        apart = np.flatnonzero((segment_of >= 0) & (memberships(segment_of, votes) < LEAST_AGREEMENT))
+        if len(apart) < LEAST:
+            break
+        segment_of = segment_of.copy()
+        first = segment_of.max() + 1
+        segment_of[apart] = first + over_segment(means[apart], features[apart], -(-len(apart) // size), seed)
+    return segment_of
 
 
 def _without_small(ids: np.ndarray, votes: MaskVotes, min_size: int) -> np.ndarray:

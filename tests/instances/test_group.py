@@ -16,7 +16,7 @@ from perception.config import InstanceConfig
 from perception.gaussians.model import Nearby, from_points
 from perception.gaussians.views import TrainingView
 from perception.instances.group import Grouping, group
-from perception.instances.votes import beside, mask_votes
+from perception.instances.votes import MaskVotes, beside, mask_votes
 from perception.rasterizer.rasterize import rasterize
 from support.blob_scenes import BlobScene, make_scene, orbit, random_scene, with_errors
 
@@ -176,6 +176,23 @@ def test_an_instance_of_12_gaussians_is_kept_when_photos_single_it_out() -> None
     scene = make_scene(row(3), CODES[:3, :8], CAMERAS, each=[300, 300, 12])
     found = run(scene)
     assert found.count == 3 and agrees(found, scene.truth)
+
+
+def test_small_things_on_a_table_are_kept_though_features_do_not_part_them() -> None:
+    """2,500 Gaussians of a table, 3 things of 14 among them, of one feature; each fills 5 pixels in each of 6 masks."""
+    rng = np.random.default_rng(0)
+    spots = np.array([[0.4, 0.4, 0], [-0.5, 0.3, 0], [0.1, -0.6, 0]])
+    table = np.append(rng.uniform(-1, 1, (2500, 2)), np.zeros((2500, 1)), axis=1)
+    things = np.repeat(spots, 14, axis=0) + rng.normal(0, 0.01, (42, 3))
+    means = np.concatenate([table, things]).astype(np.float32)
+    truth = np.append(np.zeros(2500, int), 1 + np.repeat(np.arange(3), 14))
+    owner = np.tile(np.arange(4), 6)  # of each mask
+    pixels = sparse.csr_matrix(5 * (owner == truth[:, None]), dtype=np.float32)
+    area = 5.0 * np.bincount(truth)[owner]
+    votes = MaskVotes(pixels, sparse.csr_matrix((len(means), 6), dtype=np.float32), np.repeat(np.arange(6), 4), area)
+    shape, opaque, equal = np.full((len(means), 3), 0.01), np.full(len(means), 0.9), np.zeros((len(means), 8))
+    found = group(means, shape, opaque, equal, votes, InstanceConfig())
+    assert found.count == 4 and adjusted_rand_score(truth, found.ids) > 0.99
 
 
 def test_an_object_cut_by_every_border() -> None:

@@ -1,6 +1,6 @@
 """Writes a made scene with exact truth, or the scene that the package ships for `perception demo`.
 
-python tools worlds.make tabletop|room FOLDER [--seed N]
+python tools worlds.make tabletop|room|trifles FOLDER [--seed N]
 python tools worlds.make shipped perception/demo_scene
 """
 
@@ -17,7 +17,7 @@ from worlds import DemoTruth, make_photos
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("scene", choices=("tabletop", "room", "shipped"))
+    parser.add_argument("scene", choices=("tabletop", "room", "trifles", "shipped"))
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seed", type=int, default=0, help="another N makes another scene")
     given = parser.parse_args()

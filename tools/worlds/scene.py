@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from perception.errors import InputError
-from worlds import room, tabletop
+from worlds import room, tabletop, trifles
 from worlds.cameras import Camera
 from worlds.light import WORKERS, Scene
 from worlds.render import Picture, cast
@@ -19,7 +19,7 @@ from worlds.segmenter import erring_labels, perfect_labels
 from worlds.shapes import Box, Ellipsoid, Shape, to_world
 from worlds.truth import DemoTruth, Truth
 
-SCENES = {"tabletop": tabletop, "room": room}
+SCENES = {"tabletop": tabletop, "room": room, "trifles": trifles}
 LEAST_POINTS = 1200  # minimum per object, before points that fewer than two photos see are dropped
 NOISE = 1.6  # standard deviation of the sensor noise in 8-bit steps
 QUALITY = 92
