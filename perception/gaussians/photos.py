@@ -13,7 +13,9 @@ import torch
 from perception.config import PhotoConfig
 from perception.errors import InputError
 from perception.gaussians.views import TrainingView
+from perception.io.documents import text_of
 from perception.io.memory import Keep
+from perception.io.named_files import folded
 from perception.masks.label_files import load_labels
 from perception.photos.decode import load_photo, scaled_K
 from perception.photos.depth import load_depth, without_edges
@@ -31,7 +33,7 @@ def split_scene(scene: Scene, options: PhotoConfig) -> tuple[Scene, list[View], 
     views, listed, every = scene.views, options.held_out, options.holdout
     if listed is not None:
         names = _names(Path(listed))
-        held = [bool(names & {view.name, PurePosixPath(view.name).stem}) for view in views]
+        held = [bool(names & {folded(view.name), folded(PurePosixPath(view.name).stem)}) for view in views]
         if all(held):
             raise InputError(f"{listed}: names all {len(views)} photos; some must be left to train on")
     else:
@@ -43,7 +45,7 @@ def split_scene(scene: Scene, options: PhotoConfig) -> tuple[Scene, list[View], 
 
 def _names(listed: Path) -> set[str]:
     try:
-        return {line.strip() for line in listed.read_text(encoding="utf-8").splitlines() if line.strip()}
+        return {folded(line.strip()) for line in text_of(listed.read_bytes()).splitlines() if line.strip()}
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{listed}: cannot be read; expected a text file of photo names, one a line") from error
 

@@ -80,6 +80,20 @@ def list_photos(folder: Path, suffixes: frozenset[str] = SUFFIXES) -> list[Path]
     return [folder / path for path in sorted(found)]
 
 
+def folders_below(folder: Path, depth: int) -> list[Path]:
+    """`folder` and those down to `depth` below it, sorted, without hidden ones, maps and work folders."""
+    found = [folder]
+    if depth > 0:
+        try:
+            inside = sorted(entry.name for entry in os.scandir(folder) if entry.is_dir())
+        except OSError:  # a folder without read permission
+            inside = []
+        for name in inside:
+            if not name.startswith(".") and ".gsmap" not in name:
+                found += folders_below(folder / name, depth - 1)
+    return found
+
+
 def view_name(photo: Path, folder: Path) -> str:
     """The photo's path below `folder`, as `safe_name` accepts it.
 

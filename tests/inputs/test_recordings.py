@@ -114,8 +114,6 @@ BAD = [
     ("tum", lambda s: (s / "rgb.txt").write_text("abc"), "expected lines 'time file'"),
     ("scannet", lambda s: shutil.rmtree(s / "intrinsic"), "give --camera"),
     ("scannet", lambda s: np.savetxt(s / "intrinsic/intrinsic_color.txt", np.eye(4) * 900), "were they resized"),
-    ("scannet", lambda s: np.savetxt(s / "pose/0.txt", np.diag([-1.0, 1, 1, 1])), "mirrored"),
-    ("scannet", lambda s: np.savetxt(s / "pose/3.txt", 2 * np.eye(4)), "not a rigid transform"),
     ("scannet", lambda s: np.savetxt(s / "pose/3.txt", np.eye(3)), "expected lines of 4 numbers"),
     ("scannet", lambda s: shutil.rmtree(s / "depth"), "no photo has a depth image"),
     ("7scenes", lambda s: _depth(s, 0), "hold nothing measured"),
@@ -139,6 +137,18 @@ def test_bad_recordings_are_one_line(layout: str, damage, words: str, tmp_path: 
             load_scene(source, ReadOptions(tmp_path / "work"))
         loaded(source, tmp_path)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("matrix", [np.diag([-1.0, 1, 1, 1]), 2 * np.eye(4)], ids=["mirrored", "scaled"])
+def test_one_frame_with_a_wrong_pose_is_left_out(matrix: np.ndarray, tmp_path: Path) -> None:
+    source = write_recording(tmp_path, "scannet")
+    np.savetxt(source / "pose/3.txt", matrix)
+    scene = loaded(source, tmp_path)
+    assert len(scene.views) >= 7 and "color/3.png" not in {view.name for view in scene.views}
+    (entry,) = scene.report["left_out"]
+    assert entry["name"] == "color/3.png" and "not a rigid transform" in entry["why"]
+    with pytest.raises(InputError, match=r"color/3\.png is not a rigid"):
+        load_scene(source, ReadOptions(tmp_path / "strict", strict=True))
 
 
 def test_phone_depth_of_another_size_and_lenses_per_frame(tmp_path: Path) -> None:
