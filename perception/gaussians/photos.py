@@ -27,8 +27,9 @@ from perception.types import Scene, View
 def split_scene(scene: Scene, options: PhotoConfig) -> tuple[Scene, list[View], list[View]]:
     """(the scene with its views sorted by name, training views, held-out views as exposed as their neighbours).
 
-    Held out are the views that the file `options.held_out` names, or every `options.holdout`-th: none with a holdout of
-    1 or 0, or of fewer than 4 views. InputError for a file that cannot be read or leaves no view to train on.
+    Held out are the views that the file `options.held_out` names, or those that the input sets apart, or every
+    `options.holdout`-th: none with a holdout of 1 or 0, or of fewer than 4 views. InputError for a file that cannot be
+    read or leaves no view to train on.
     """
     views, listed, every = scene.views, options.held_out, options.holdout
     if listed is not None:
@@ -36,6 +37,8 @@ def split_scene(scene: Scene, options: PhotoConfig) -> tuple[Scene, list[View], 
         held = [bool(names & {folded(view.name), folded(PurePosixPath(view.name).stem)}) for view in views]
         if all(held):
             raise InputError(f"{listed}: names all {len(views)} photos; some must be left to train on")
+    elif every > 1 and 0 < sum(view.held_out for view in views) < len(views):
+        held = [view.held_out for view in views]
     else:
         held = [every > 1 and len(views) >= 4 and index % every == 0 for index in range(len(views))]
     training = list(compress(views, [not is_held for is_held in held]))

@@ -151,7 +151,9 @@ def _checked_text(model: Model) -> dict[int, int]:
 
 
 def _start(data: bytes) -> int:
-    """Where the first line lies that is no comment."""
+    """Where the first line lies that is no comment; the end for UTF-16."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return len(data)
     at = 3 if data.startswith(codecs.BOM_UTF8) else 0
     while data.startswith(b"#", at):
         at = data.find(b"\n", at) + 1 or len(data)

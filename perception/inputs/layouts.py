@@ -31,7 +31,7 @@ _TUM_LENSES = {  # fx fy cx cy k1 k2 p1 p2 k3, from the data set's page on calib
 _PRIMESENSE = (525.0, 525.0, 319.5, 239.5)  # the intrinsics that Redwood and Open3D assume for 640 × 480 pixels
 _KINECT_DEPTH, _KINECT_COLOR = (585.0, 585.0, 320.0, 240.0), (525.0, 525.0, 320.0, 240.0)
 _SIZE = (640, 480)
-_COMMA = re.compile(r"[+-]?\d+,\d+")
+_COMMA = re.compile(r"[+-]?\d+,\d+(e[+-]?\d+)?", re.IGNORECASE)
 _TEXTS = (
     *("rgb.txt", "depth.txt", "groundtruth.txt", "pose/*.txt", "intrinsic/*.txt", "frame-*.pose.txt"),
     *("seq*/frame-*.pose.txt", "camera-intrinsics.txt", "*.log", "*intrinsic*.json", "camera*.json"),
@@ -223,8 +223,9 @@ def _images(folder: Path) -> list[Path]:
 
 def _numbers(file: Path, columns: int) -> np.ndarray:
     """[N, at least `columns`] float64."""
+    rows = _rows(file)
     try:
-        table = np.array(_rows(file), np.float64)
+        table = np.array(rows, np.float64)
         if table.shape[1] < columns:
             raise ValueError(f"found {table.shape[1]}")
     except ValueError as error:

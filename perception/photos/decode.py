@@ -110,8 +110,13 @@ def read_photo(path: Path, as_stored: bool = False) -> np.ndarray:
         if factor > 1:
             image.draft(None, (width // factor, height // factor))  # only JPEG is decoded at a reduced size
             factor = max(1, round(factor * image.width / width))
+        back = _BACK.get(getattr(image, "tag_v2", {}).get(ORIENTATION, 1))  # Pillow turns a TIFF when it decodes it
         decode(image, path)
-        photo = to_rgb(_as_stored(image) if as_stored else upright(image, path), path)
+        if not as_stored:
+            image = upright(image, path)
+        elif back is not None:
+            image = image.transpose(back)
+        photo = to_rgb(image, path)
     return photo if factor == 1 else np.array(Image.fromarray(photo).reduce(factor))
 
 
@@ -125,12 +130,6 @@ _BACK = {
     8: Image.Transpose.ROTATE_270,
 }
 """What undoes the rotation of an upright picture, by EXIF's orientation."""
-
-
-def _as_stored(image: Image.Image) -> Image.Image:
-    """A decoded picture without EXIF rotation, which Pillow applies to TIFF by itself."""
-    back = _BACK.get(getattr(image, "tag_v2", {}).get(ORIENTATION, 1))
-    return image if back is None else image.transpose(back)
 
 
 def read_grey(path: Path, as_stored: bool = False) -> np.ndarray:

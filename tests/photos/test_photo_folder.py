@@ -219,6 +219,45 @@ def test_heic_is_read(tmp_path: Path) -> None:
     assert why_left_out(file) is not None
 
 
+@pytest.mark.parametrize("kind", ["HEIF", "WEBP", "PNG", "TIFF", "AVIF"])
+def test_pictures_under_a_wrong_ending_are_read(kind: str, tmp_path: Path) -> None:
+    if kind == "HEIF":
+        pytest.importorskip("pillow_heif").register_heif_opener()
+    file = tmp_path / "IMG_1.jpg"
+    Image.fromarray(texture(0, (160, 128))).save(file, format=kind, quality=95)
+    assert why_left_out(file) is None and photo_size(file) == (160, 128)
+    assert np.abs(read_photo(file).astype(int) - texture(0, (160, 128))).mean() < 12  # the loss of the codecs
+
+
+def test_a_jpeg_called_heic_needs_no_reader_of_heic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    Image.fromarray(texture(0)).save(tmp_path / "IMG_1.HEIC", format="JPEG")
+    assert photo_size(tmp_path / "IMG_1.HEIC") == (160, 120)
+
+
+@pytest.mark.parametrize("folder", ["images_2", "images_4", "images_8", "thumbnails"])
+def test_smaller_copies_beside_the_photos_are_doubles(folder: str, tmp_path: Path) -> None:
+    share = {"images_4": 4, "images_8": 8}.get(folder, 2)
+    for index in range(4):
+        whole = Image.open(save(tmp_path / "images" / f"{index}.jpg", index, (643, 482), quality=95))
+        (tmp_path / folder).mkdir(exist_ok=True)
+        whole.resize((643 // share, 482 // share), Image.Resampling.BOX).save(tmp_path / folder / f"{index}.png")
+    chosen = choose_photos(tmp_path, False, Told())
+    assert chosen.names == [f"images/{index}.jpg" for index in range(4)]
+    assert all("the same picture as images/" in entry["why"] for entry in chosen.left_out)
+    assert "4 of 8 photos are doubles" in chosen.notes[0]
+
+
+def test_photos_of_one_name_that_show_different_things_all_stay(tmp_path: Path) -> None:
+    """As of two cameras: of equal size, or of another size and another view."""
+    save(tmp_path / "left" / "0.png", 0)
+    Image.fromarray(np.roll(texture(0), 3, axis=1)).save(save(tmp_path / "right" / "0.png", 1))
+    save(tmp_path / "small" / "0.png", 2, (80, 60))
+    assert choose_photos(tmp_path, False, Told()).names == ["left/0.png", "right/0.png", "small/0.png"]
+
+
 def test_heic_without_its_reader_names_the_line_that_installs_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
