@@ -40,7 +40,10 @@ class Settings(BaseModel):
 class PhotoConfig(Settings):
     max_side: int = Field(800, ge=16, le=65536, description="pixels of the long side at which the map is trained")
     holdout: int = Field(
-        8, ge=0, le=10**6, description="every N-th photo is kept out of training for scoring; 0: all are trained on"
+        8,
+        ge=0,
+        le=10**6,
+        description="every N-th photo, or the test part of the input, is kept for scoring; 0: all are trained on",
     )
     held_out: str | None = Field(None, description="text file of the photos kept for scoring instead, a name a line")
     camera: str | None = Field(None, description="ROS camera_info YAML: the intrinsics of all photos, kept fixed")

@@ -37,7 +37,7 @@ def far_from_most(centres: np.ndarray, scale: float = 0.0) -> np.ndarray:
     (the distance of what the cameras see; 0 = unknown). A camera that drives away leaves no gap."""
     distance = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
     order = np.argsort(distance, kind="stable")
-    outer = np.arange(max(len(order) * 3 // 4, 2), len(order))
+    outer = np.arange(max(len(order) - len(order) // 4, 2), len(order))
     before = np.maximum(distance[order[outer - 1]], scale)
     gaps = outer[(before > 0) & (distance[order[outer]] > FAR_GAP * before)]
     far = np.zeros(len(order), bool)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from perception.errors import InputError
@@ -16,6 +16,7 @@ from perception.inputs.transforms import json_files, listed_files, listed_photos
 from perception.photos import video
 from perception.photos.decode import photo_size
 from perception.photos.folder import VIDEO_SUFFIXES, list_photos
+from perception.photos.views import fit_lens
 from perception.sfm.options import ReadOptions
 from perception.sfm.reconstruct import reconstruct
 from perception.types import Scene
@@ -70,7 +71,7 @@ def _read_video(source: Path, options: ReadOptions) -> Scene:
     new = not folder.exists()
     record = video.video_frames(source, folder, options.progress)
     try:
-        scene = reconstruct(folder, options)
+        scene = _reconstructed(folder, options)
     except InputError:
         if new:
             shutil.rmtree(folder, ignore_errors=True)
@@ -94,7 +95,18 @@ def _recording_files(source: Path) -> list[Path]:
 
 def _read_photos(source: Path, options: ReadOptions) -> Scene:
     refuse_depth_without_poses(source)
-    return reconstruct(source, options)
+    return _reconstructed(source, options)
+
+
+def _reconstructed(folder: Path, options: ReadOptions) -> Scene:
+    """`reconstruct`, with the lens of a camera file scaled to the photos where they were resized."""
+    if (lens := options.lens) is None:
+        return reconstruct(folder, options)
+    for photo in list_photos(folder):
+        with contextlib.suppress(InputError):
+            lens = fit_lens(lens, photo, as_stored=False) or lens
+            break
+    return reconstruct(folder, replace(options, lens=lens))
 
 
 READERS = (

@@ -7,7 +7,6 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,94 +15,13 @@ from PIL import Image
 from perception.config import PhotoConfig
 from perception.errors import InputError
 from perception.gaussians.photos import split_scene
-from perception.geometry import inverse_se3
 from perception.inputs.load import input_files, load_scene, photo_sizes
-from perception.io.cloud import write_cloud
 from perception.masks.label_folder import LabelFolder
-from perception.photos.decode import load_photo
 from perception.photos.ignore_masks import mask_of
 from perception.photos.lens import load_pycolmap
 from perception.photos.scene_file import load_saved_scene, save_scene
 from perception.sfm.options import ReadOptions
-from perception.types import PointCloud, Scene
-from support.aimed import look_at
-
-SIZE = (64, 48)
-CAMERA = "1 PINHOLE 64 48 60 61 32 24"
-NAMES = [f"{index}.png" for index in range(8)]
-
-
-def pose(index: int) -> np.ndarray:
-    """camera_from_world [4, 4] of photo `index`: cameras in a row that look at the origin."""
-    return look_at(np.array([0.3 * index - 1, -3.0, 1.0]), np.zeros(3), np.array([0, 0, 1.0]))
-
-
-def photo(path: Path, index: int = 0, size: tuple[int, int] = SIZE, **options: Any) -> np.ndarray:
-    pixels = np.random.default_rng(index).integers(0, 255, (*size[::-1], 3), dtype=np.uint8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(pixels).save(path, **options)
-    return pixels
-
-
-def write_model(folder: Path, names: list[str] = NAMES, cameras: str = CAMERA, points: int = 60) -> Path:
-    """A text model with the exact poses of `pose`, and points without tracks."""
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "cameras.txt").write_text(f"# Camera list\n#   CAMERA_ID, MODEL, WIDTH\n{cameras}\n")
-    lines = ["# Image list, two lines each"]
-    for index, name in enumerate(names):
-        lines += [f"{index + 1} {numbers(pose(index))} 1 {name}", ""]
-    (folder / "images.txt").write_text("\n".join(lines) + "\n")
-    xyz = np.random.default_rng(0).normal(0, 0.5, (points, 3))
-    rows = [f"{i + 1} {x:.6f} {y:.6f} {z:.6f} 10 20 30 0.5" for i, (x, y, z) in enumerate(xyz)]
-    (folder / "points3D.txt").write_text("# 3D point list, with commas, in its head\n" + "\n".join(rows) + "\n")
-    return folder
-
-
-def numbers(matrix: np.ndarray) -> str:
-    rotation = load_pycolmap().Rotation3d(matrix[:3, :3])
-    x, y, z, w = rotation.quat
-    return " ".join(f"{value:.17g}" for value in (w, x, y, z, *matrix[:3, 3]))
-
-
-def workspace(
-    folder: Path, model: str = "sparse/0", photos: str = "images", names: list[str] = NAMES, **kw: Any
-) -> Path:
-    for index, name in enumerate(names):
-        photo(folder / photos / name, index)
-    write_model(folder / model, names, **kw)
-    return folder
-
-
-def frames_of(folder: Path, prefix: str = "images/", count: int = 8) -> list[dict[str, Any]]:
-    worlds = [inverse_se3(pose(index)) @ np.diag([1, -1, -1, 1]) for index in range(count)]
-    return [
-        {"file_path": f"{prefix}{name}", "transform_matrix": w.tolist()} for name, w in zip(NAMES, worlds, strict=False)
-    ]
-
-
-def transforms(folder: Path, prefix: str = "images/", **changes: Any) -> dict[str, Any]:
-    for index, name in enumerate(NAMES):
-        photo(folder / "images" / name, index)
-    write_cloud(folder / "c.ply", PointCloud(np.random.default_rng(0).normal(0, 0.5, (60, 3))))
-    data = {"w": 64, "h": 48, "fl_x": 60, "fl_y": 61, "cx": 32, "cy": 24, "ply_file_path": "c.ply"}
-    data |= {"frames": frames_of(folder, prefix), **changes}
-    (folder / "transforms.json").write_text(json.dumps(data))
-    return data
-
-
-def loaded(source: Path, strict: bool = False, masks: Path | None = None) -> Scene:
-    work = source.parent / f"work{strict}" if source.is_file() else source.parent / f"{source.name}.gsmap.work{strict}"
-    return load_scene(source, ReadOptions(work, poses="keep", strict=strict, masks=masks))
-
-
-def check_poses(scene: Scene, kept: list[int] | None = None) -> None:
-    """The views are the photos `kept` (None: all), with the poses that were written."""
-    numbered = list(range(8)) if kept is None else kept
-    assert [view.photo.stem for view in scene.views] == [str(index) for index in numbered]
-    for view, index in zip(scene.views, numbered, strict=True):
-        np.testing.assert_allclose(view.camera_from_world, pose(index), atol=1e-9)
-        assert view.K[0, 0] == 60 and view.K[1, 1] == 61
-
+from support.given_poses import NAMES, SIZE, check_poses, loaded, photo, transforms, workspace, write_model
 
 PLACES = [
     ("sparse/0", "images"),
@@ -299,84 +217,6 @@ def test_the_same_in_a_binary_model(what: str, tmp_path: Path) -> None:
     for view in scene.views:
         expected = truth.find_image_with_name(view.name).cam_from_world().matrix()
         np.testing.assert_allclose(view.camera_from_world[:3], expected, atol=1e-9)
-
-
-SIZES = [
-    (257, 193),
-    (255, 191),
-    (128, 96),
-    (129, 97),
-    (127, 95),
-    (513, 385),
-    (511, 383),
-    (100, 75),
-    (101, 75),
-    (32, 24),
-]
-
-
-@pytest.mark.parametrize("size", SIZES, ids=[f"{w}x{h}" for w, h in SIZES])
-def test_sizes_that_other_tools_round(size: tuple[int, int], tmp_path: Path) -> None:
-    width, height = size
-    scene = loaded(
-        workspace(tmp_path / "in", cameras=f"1 PINHOLE {width} {height} {width} {width} {width / 2} {height / 2}")
-    )
-    for view in scene.views:
-        assert (view.width, view.height) == SIZE
-        np.testing.assert_allclose(view.K[:2, 2], (32, 24))  # the centre stays the centre
-        assert view.K[0, 0] == pytest.approx(64) and view.K[1, 1] == pytest.approx(width * 48 / height)
-
-
-@pytest.mark.parametrize("size", [(65, 48), (64, 64), (96, 48), (48, 64)])
-def test_cameras_of_another_shape_are_refused(size: tuple[int, int], tmp_path: Path) -> None:
-    folder = workspace(tmp_path / "in", cameras="1 PINHOLE {} {} 60 60 32 24".format(*size))
-    with pytest.raises(InputError, match=r"64×48 but its camera says"):
-        loaded(folder)
-
-
-@pytest.mark.parametrize("orientation", range(1, 9))
-@pytest.mark.parametrize("size", [(64, 48), (48, 48)])
-@pytest.mark.parametrize("suffix", [".png", ".tif"])
-def test_exif_never_turns_photos_against_given_poses(
-    orientation: int, size: tuple[int, int], suffix: str, tmp_path: Path
-) -> None:
-    exif = Image.Exif()
-    exif[0x0112] = orientation
-    pixels = photo(tmp_path / "images" / f"0{suffix}", 3, size, exif=exif)
-    write_model(tmp_path / "sparse", [f"0{suffix}"], "1 PINHOLE {} {} 60 60 24 24".format(*size))
-    (view,) = loaded(tmp_path).views
-    np.testing.assert_array_equal(load_photo(view), pixels)
-    save_scene(tmp_path / "kept", loaded(tmp_path))
-    kept = load_saved_scene(tmp_path / "kept")
-    assert kept is not None
-    np.testing.assert_array_equal(load_photo(kept.views[0]), pixels)
-
-
-def test_a_camera_of_the_upright_photo_takes_it_upright(tmp_path: Path) -> None:
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    pixels = photo(tmp_path / "images/0.png", 3, exif=exif)
-    write_model(tmp_path / "sparse", ["0.png"], "1 PINHOLE 48 64 60 60 24 32")
-    np.testing.assert_array_equal(load_photo(loaded(tmp_path).views[0]), np.rot90(pixels, -1))
-
-
-@pytest.mark.parametrize("kind", ["model", "transforms"])
-def test_a_camera_kilometres_away_is_left_out_and_named(kind: str, tmp_path: Path) -> None:
-    far = np.eye(4)
-    far[:3, 3] = 3000, -2000, 5000
-    if kind == "model":
-        file = workspace(tmp_path / "in") / "sparse/0/images.txt"
-        file.write_text(file.read_text().replace(numbers(pose(7)), numbers(far)))
-    else:
-        data = transforms(tmp_path / "in")
-        data["frames"][7]["transform_matrix"] = inverse_se3(far).tolist()
-        (tmp_path / "in" / "transforms.json").write_text(json.dumps(data))
-    scene = loaded(tmp_path / "in")
-    check_poses(scene, list(range(7)))
-    (entry,) = scene.report["left_out"]
-    assert entry["name"] == "7.png" and "6.17e+03 units" in entry["why"]
-    with pytest.raises(InputError, match=r"7\.png"):
-        loaded(tmp_path / "in", strict=True)
 
 
 def test_poses_of_other_programs_are_named(tmp_path: Path) -> None:

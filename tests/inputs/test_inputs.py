@@ -158,6 +158,9 @@ def test_folders_that_are_no_scene(tmp_path):
     camera.write_text(CAMERA)
     with pytest.raises(InputError, match="camera file says 100×80"):
         load_scene(tmp_path / "photos", ReadOptions(tmp_path / "work", camera=camera))
+    camera.write_text(CAMERA.replace("100", "241").replace("80", "161"))  # the photos are a quarter, rounded down
+    with pytest.raises(InputError, match="could be registered"):
+        load_scene(tmp_path / "photos", ReadOptions(tmp_path / "work", camera=camera))
     data = (tmp_path / "photos" / "c.png").read_bytes()
     (tmp_path / "photos" / "c.png").write_bytes(data[: len(data) // 2])
     with pytest.raises(InputError, match=r"c.png.*(truncated|damaged)"):

@@ -219,6 +219,20 @@ def test_heic_is_read(tmp_path: Path) -> None:
     assert why_left_out(file) is not None
 
 
+def test_photos_of_given_poses_are_staged_as_stored(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    photos = [save(tmp_path / name, 0, exif=exif) for name in ("0.jpg", "1.tif")]
+    lens = Lens("PINHOLE", (100.0, 100.0, 80.0, 60.0), 160, 120)
+    options, masks = ReadOptions(tmp_path / "work"), [save(tmp_path / "mask.png", 1), None]
+    for as_stored in ([True, True], [False, False]):
+        store = build_features(photos, [lens, lens], options, masks, posed=True, as_stored=as_stored)
+        for photo, name in zip(photos, store.names, strict=True):
+            staged = np.asarray(Image.open(store.image_root / name)).astype(int)
+            expected = texture(0) if as_stored[0] else texture(0)[::-1, ::-1]
+            assert np.abs(staged - expected).mean() < 12, photo
+
+
 @pytest.mark.parametrize("kind", ["HEIF", "WEBP", "PNG", "TIFF", "AVIF"])
 def test_pictures_under_a_wrong_ending_are_read(kind: str, tmp_path: Path) -> None:
     if kind == "HEIF":
