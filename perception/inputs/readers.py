@@ -12,7 +12,14 @@ from perception.errors import InputError
 from perception.inputs import recordings
 from perception.inputs.colmap import is_workspace, model_files, model_photos, models_below, read_workspace
 from perception.inputs.layouts import layout_of, open_recording, refuse_depth_without_poses, text_files
-from perception.inputs.transforms import json_files, listed_files, listed_photos, read_transforms, transforms_files
+from perception.inputs.transforms import (
+    faults,
+    json_files,
+    listed_files,
+    listed_photos,
+    read_transforms,
+    transforms_files,
+)
 from perception.photos import video
 from perception.photos.decode import photo_size
 from perception.photos.folder import VIDEO_SUFFIXES, list_photos
@@ -154,9 +161,10 @@ EXPECTED = (
 )
 UNREAD = (
     *("*.nvm", "bundle*.out", "cameras.xml", "cameras.sfm", "sfm_data.json", "poses_bounds.npy", "reconstruction.json"),
-    *("model.tsv", "*.rsproj", "*.psx"),
+    *("cameras.json", "model.tsv", "*.rsproj", "*.psx"),
 )
-"""Files of other programs that hold poses of photos, which are not read."""
+"""Files of other programs that hold poses of photos and are not read: Bundler, Metashape, Meshroom, OpenMVG, LLFF,
+OpenSfM, Gaussian splatting, RealityScan."""
 
 
 def reader_of(source: Path) -> Reader:
@@ -173,7 +181,8 @@ def other_inputs(source: Path, reader: Reader) -> list[str]:
     """A line on what folder `source`, read by `reader`, holds besides, and one on poses that lie beside it."""
     if not source.is_dir():
         return []
-    kinds, lines = [reader.name for reader in READERS], []
+    kinds = [reader.name for reader in READERS]
+    lines = [f"its poses are not read: {fault}" for fault in faults(source)]
     used = transforms_files(source) if reader.name == kinds[2] else []
     others = [path.relative_to(source).as_posix() for path in json_files(source) if path not in used]
     if reader.name in kinds[1:3] and layout_of(source) is not None:

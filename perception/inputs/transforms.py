@@ -32,6 +32,7 @@ _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"
 MILLIMETRE = 1e-3
 """Unit of depth images without `depth_unit_scale_factor` or `integer_depth_scale`, in metres: nerfstudio's default."""
 _TRAIN, _PART = "transforms_train.json", re.compile(r"transforms_(train|test|val\w*|eval)\.json$")
+_FRAMES = re.compile(rb'"frames"\s*:\s*\[')
 _NEEDED, _LACKS = {"file_path", "transform_matrix"}, "lacks file_path or transform_matrix"
 GRAVITY_ERROR = 1.0
 """Standard error in degrees of a `gravity` without `gravity_std_deg`, as of a phone's motion sensors."""
@@ -90,19 +91,32 @@ def json_files(folder: Path) -> list[Path]:
     """JSON files with frames in a folder or its `images`, in order of preference: `transforms.json`,
     `transforms_train.json`, its other parts, any other by name."""
     ranks = ("transforms.json", _TRAIN)
-    found = [path for inside in (folder, folder / "images") for path in sorted(inside.glob("*.json"))]
-    found = [path for path in found if path.name == ranks[0] or _has_frames(path)]
+    found = [path for path in _listing_frames(folder) if path.name == ranks[0] or _fault(path) is None]
     return sorted(
         found, key=lambda path: (ranks.index(path.name) if path.name in ranks else 2, not _PART.match(path.name))
     )
 
 
-def _has_frames(file: Path) -> bool:
+def faults(folder: Path) -> list[str]:
+    """Why JSON files that list frames are not among `json_files`, a line each."""
+    return [fault for path in _listing_frames(folder) if (fault := _fault(path)) is not None]
+
+
+def _listing_frames(folder: Path) -> list[Path]:
+    found = [
+        path
+        for inside in (folder, folder / "images")
+        for path in sorted(inside.glob("*.json"))
+        if os.access(path, os.R_OK)
+    ]
+    return [path for path in found if path.name == "transforms.json" or _FRAMES.search(path.read_bytes())]
+
+
+def _fault(file: Path) -> str | None:
     try:
-        data = file.read_bytes()
-        return b'"frames"' in data and b'"transform_matrix"' in data and bool(_load(file)["frames"])
-    except (OSError, InputError):
-        return False
+        return None if _load(file)["frames"] else f"{file}: 'frames' is empty"
+    except InputError as error:
+        return str(error)
 
 
 def read_frames(file: Path) -> list[tuple[str, np.ndarray, Lens]]:

@@ -16,12 +16,13 @@ from perception.config import PhotoConfig
 from perception.errors import InputError
 from perception.gaussians.photos import split_scene
 from perception.inputs.load import input_files, load_scene, photo_sizes
+from perception.inputs.readers import other_inputs, reader_of
 from perception.masks.label_folder import LabelFolder
 from perception.photos.ignore_masks import mask_of
 from perception.photos.lens import load_pycolmap
 from perception.photos.scene_file import load_saved_scene, save_scene
 from perception.sfm.options import ReadOptions
-from support.given_poses import NAMES, SIZE, check_poses, loaded, photo, transforms, workspace, write_model
+from support.given_poses import CAMERA, NAMES, SIZE, check_poses, loaded, photo, transforms, workspace, write_model
 
 PLACES = [
     ("sparse/0", "images"),
@@ -219,10 +220,25 @@ def test_the_same_in_a_binary_model(what: str, tmp_path: Path) -> None:
         np.testing.assert_allclose(view.camera_from_world[:3], expected, atol=1e-9)
 
 
-def test_poses_of_other_programs_are_named(tmp_path: Path) -> None:
-    """They are not read; photos of noise give no poses."""
-    from perception.inputs.readers import other_inputs, reader_of
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ('{"frames": [{"file_path": "a.png", "pose": []}]}', "frame 0 lacks file_path or transform_matrix"),
+        ('{"frames": [{"file_path": "a.png", "transform_matrix": []},]}', "not readable JSON"),
+        ('{"frames": []}', "is empty"),
+    ],
+)
+def test_json_with_frames_that_cannot_be_read_says_why(text: str, why: str, tmp_path: Path) -> None:
+    photo(tmp_path / "images" / "a.png")
+    (tmp_path / "transforms_train.json").write_text(text)
+    (tmp_path / "settings.json").write_text('{"frames": 3}')
+    reader = reader_of(tmp_path)
+    assert reader.name == "photos"
+    (line,) = other_inputs(tmp_path, reader)
+    assert f"{tmp_path / 'transforms_train.json'}" in line and why in line and "\n" not in line
 
+
+def test_poses_of_other_programs_are_named(tmp_path: Path) -> None:
     for index, name in enumerate(NAMES):
         photo(tmp_path / "in" / "images" / name, index)
     (tmp_path / "in" / "poses_bounds.npy").write_bytes(b"x")
