@@ -13,7 +13,7 @@ from perception.inputs.colmap_files import Model, names_in, read_model
 from perception.inputs.far import without_far
 from perception.io.documents import safe_name
 from perception.io.named_files import NamedFiles, parts_of
-from perception.photos.folder import folders_below
+from perception.photos.folder import folders_below, list_photos
 from perception.photos.views import first_of
 from perception.sfm.model import cloud_of, views_of_model
 from perception.sfm.options import ReadOptions
@@ -56,9 +56,12 @@ def model_files(folder: Path) -> list[Path]:
 
 
 def model_photos(folder: Path) -> list[Path]:
-    """The photos of the preferred models of a workspace that exist."""
-    parts = _preferred(folder)
-    names = sorted({name for path in parts for name in names_in(path)})
+    """The photos of the preferred models of a workspace that exist; of a damaged model all those in `images`."""
+    parts, images = _preferred(folder), folder / _PHOTOS[0]
+    try:
+        names = sorted({name for path in parts for name in names_in(path)})
+    except InputError:
+        return list_photos(images) if images.is_dir() else []
     files = NamedFiles(photo_folder(folder, parts[0], names))
     return [path for path in map(files.find, names) if path is not None]
 

@@ -224,10 +224,13 @@ def _frames(file: Path, held_out: bool = False) -> list[_Frame]:
     """The frames of a file. held_out: the file is another part than "train"; else the lists of nerfstudio say."""
     data = _load(file)
     shared = {key: value for key, value in data.items() if key != "frames"}
-    named = {key: {str(name) for name in data.get(f"{key}_filenames") or ()} for key in ("train", "val", "test")}
-    test = (named["val"] | named["test"]) - named["train"]
+    listed = (data.get(f"{key}_filenames") for key in ("train", "val", "test"))
+    train, val, test = ({str(name) for name in names} if isinstance(names, list) else set() for names in listed)
     own = [frame if isinstance(frame, dict) else {} for frame in data["frames"]]
-    return [_Frame(file, {**shared, **values}, held_out or str(values.get("file_path")) in test) for values in own]
+    return [
+        _Frame(file, {**shared, **values}, held_out or str(values.get("file_path")) in (val | test) - train)
+        for values in own
+    ]
 
 
 def _pose(file: Path, frame: dict[str, Any]) -> np.ndarray:
@@ -277,7 +280,7 @@ def _lens(file: Path, values: dict[str, Any], photo: Path | None) -> Lens:
     if width is None or height is None:
         if photo is None:
             raise InputError(f"{what} has no w and h")
-        width, height = photo_size(photo)
+        width, height = photo_size(photo, as_stored=True)
     fx, fy = _focals(values, what, width, height)
     cx, cy = _number(values, "cx", what), _number(values, "cy", what)
     center = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)
