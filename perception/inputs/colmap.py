@@ -109,6 +109,7 @@ def read_workspace(folder: Path, options: ReadOptions) -> Scene:
     if len(cloud[0]) < MIN_POINTS:
         facts["warnings"].append(f"{path}: the sparse model holds {len(cloud[0])} points; new ones are triangulated")
     error = _reprojection_error(reconstruction)
+    facts["notes"] = [f"poses of {folder}: COLMAP model {path.relative_to(folder)}"]
     facts |= {"model": path.relative_to(folder).as_posix(), "mean_reprojection_error_px": error}
     return posed_scene(views, cloud, {"input": "colmap", **facts}, options, MIN_POINTS)
 

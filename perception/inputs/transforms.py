@@ -59,7 +59,6 @@ def read_transforms(source: Path, options: ReadOptions) -> Scene:
     if listed is None and data.get("ply_file_path"):
         listed = start_points(listing.needed(file, "ply_file_path", data["ply_file_path"]))
     views, far = without_far(views, (listed or NO_CLOUD)[0], set(), options.strict, file)
-    notes = [*notes, *([f"{len(files)} files are read: {', '.join(f.name for f in files)}"] if len(files) > 1 else [])]
     facts: dict[str, Any] = {
         "input": "transforms",
         "left_out": [*missing, *far],
@@ -69,8 +68,9 @@ def read_transforms(source: Path, options: ReadOptions) -> Scene:
     facts["mean_reprojection_error_px"] = None
     if options.cloud is None and listed is not None:
         facts["points_from"] = str(data["ply_file_path"])
-    if held := sum(view.held_out for view in views):
-        facts["notes"] = [f"{file.parent}: {held} of {len(views)} photos are of its test and val parts"]
+    held = sum(view.held_out for view in views)
+    split = f"; {held} of {len(views)} photos are of its test and val parts" if held else ""
+    facts["notes"] = [f"poses of {file.parent}: {', '.join(each.name for each in files)}{split}"]
     scene = posed_scene(views, listed or NO_CLOUD, facts, options, least=1)
     return replace(scene, metric=data.get("metric") is True)
 

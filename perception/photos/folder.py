@@ -14,7 +14,7 @@ from PIL import Image
 from perception.errors import InputError
 from perception.machine import cores
 from perception.photos.decode import SUFFIXES, decode, open_photo, photo_size, upright
-from perception.photos.lens import same_aspect
+from perception.photos.lens import resized
 from perception.photos.video import FRAMES_RECORD, THUMBNAIL, motion_between
 from perception.progress import Progress
 
@@ -205,7 +205,7 @@ def _leave_out_copies(looks: list[_Look]) -> None:
 
 
 def _is_copy(small: _Look, large: _Look) -> bool:
-    if not same_aspect(small.size, large.size):
+    if not resized(small.size, large.size):
         return False
     grey = cv2.resize(large.grey, small.grey.shape[::-1], interpolation=cv2.INTER_AREA)
     # Programs that resize differ in sharpness, which blurring evens out.

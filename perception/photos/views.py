@@ -10,7 +10,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.geometry import nearest_rotation
 from perception.photos.decode import is_turned, photo_size
-from perception.photos.lens import is_pinhole, pinhole_from_lens, rescale_lens
+from perception.photos.lens import is_pinhole, pinhole_from_lens, rescale_lens, resized
 from perception.types import Lens, View
 
 FARTHEST = 1e12
@@ -60,17 +60,13 @@ def posed_view(
 
 
 def fit_lens(lens: Lens, photo: Path, as_stored: bool) -> Lens | None:
-    """The lens scaled to the size at which the photo is read; None for a camera of another shape.
-    Other tools round the size of a resized photo up or down: it may be off by less than a pixel."""
+    """The lens scaled to the size at which the photo is read; None for a camera of another shape."""
     size, full = photo_size(photo, as_stored), (lens.width, lens.height)
     if size == full:
         return lens
-    ratios = [(min(a, b), max(a, b)) for a, b in zip(size, full, strict=True)]
-    low, high = max((a - 1) / b for a, b in ratios), min((a + 1) / b for a, b in ratios)
-    resized = abs(size[0] * size[1] / (full[0] * full[1]) - 1) > _RESIZED and (size[0] < full[0]) == (size[1] < full[1])
-    if size[0] * full[1] == size[1] * full[0] or (resized and low < high):
-        return rescale_lens(lens, *size)
-    return None
+    other = abs(size[0] * size[1] / (full[0] * full[1]) - 1) > _RESIZED
+    fits = size[0] * full[1] == size[1] * full[0] or (other and resized(size, full))
+    return rescale_lens(lens, *size) if fits else None
 
 
 def view_lens(view: View) -> Lens:

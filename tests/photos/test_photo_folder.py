@@ -255,9 +255,9 @@ def test_a_jpeg_called_heic_needs_no_reader_of_heic(tmp_path: Path, monkeypatch:
 def test_smaller_copies_beside_the_photos_are_doubles(folder: str, tmp_path: Path) -> None:
     share = {"images_4": 4, "images_8": 8}.get(folder, 2)
     for index in range(4):
-        whole = Image.open(save(tmp_path / "images" / f"{index}.jpg", index, (643, 482), quality=95))
+        whole = Image.open(save(tmp_path / "images" / f"{index}.jpg", index, (270, 481), quality=95))
         (tmp_path / folder).mkdir(exist_ok=True)
-        whole.resize((643 // share, 482 // share), Image.Resampling.BOX).save(tmp_path / folder / f"{index}.png")
+        whole.resize((270 // share, 481 // share), Image.Resampling.BOX).save(tmp_path / folder / f"{index}.png")
     chosen = choose_photos(tmp_path, False, Told())
     assert chosen.names == [f"images/{index}.jpg" for index in range(4)]
     assert all("the same picture as images/" in entry["why"] for entry in chosen.left_out)
