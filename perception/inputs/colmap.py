@@ -22,6 +22,7 @@ from perception.types import Scene
 
 DEPTH = 3
 """Folders below the input in which models are looked for, and photos one less: "colmap/sparse/0" and "dslr/images"."""
+LOOKED_AT = 200
 SHARED = 15
 """Least number of points that a photo far from all others must share with them: half of the inliers that COLMAP asks of
 a pose."""
@@ -68,7 +69,8 @@ def model_photos(folder: Path) -> list[Path]:
 
 def photo_folder(folder: Path, model: Path, names: Sequence[str]) -> Path:
     """The folder that holds most photos of a model: `images`, `input` (first for `distorted`) or the input itself where
-    one of them holds half, else any folder below."""
+    one of them holds half, else any folder below. Some of the names are tried, LOOKED_AT at most."""
+    names = names[:: -(-len(names) // LOOKED_AT) or 1]
     usual = [folder / name for name in _PHOTOS]
     usual = usual[::-1] if _DISTORTED in model.relative_to(folder).parts else usual
     best, most = usual[0], 0

@@ -181,7 +181,10 @@ def _views(
     for index, values in enumerate(frame.values for frame in frames):
         photo = listing.find(str(values.get("file_path")))
         why = "listed, but the photo is missing" if photo is None else why_left_out(photo, options.strict)
-        why = why if values.keys() >= _NEEDED else f"{file}: the frame {_LACKS}"
+        if not values.keys() >= _NEEDED:
+            why = f"{file}: frame {index} {_LACKS}"
+            if options.strict:
+                raise InputError(why)
         if photo is None or why is not None:
             missing.append({"name": str(values.get("file_path", f"frame {index}")), "why": str(why)})
         else:

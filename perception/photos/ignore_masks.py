@@ -23,8 +23,9 @@ def mask_of(folder: Path | None, name: str) -> Path | None:
     """The mask of photo `name` in `folder`: "a/1.png" or "a/1.jpg.png" for "a/1.jpg"; None without one."""
     if folder is None:
         return None
-    files = NamedFiles(folder)
-    return files.find(str(Path(name).with_suffix(".png"))) or files.find(f"{name}.png")
+    names = (str(Path(name).with_suffix(".png")), f"{name}.png")
+    exact = next((folder / name for name in names if (folder / name).is_file()), None)
+    return exact or next(filter(None, map(NamedFiles(folder).find, names)), None)
 
 
 def read_mask(path: Path, width: int, height: int) -> np.ndarray:

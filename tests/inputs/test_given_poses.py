@@ -110,6 +110,18 @@ def test_nerfstudios_lists_are_the_held_out_set(tmp_path: Path) -> None:
     assert [view.name for view in held] == NAMES[6:]
 
 
+def test_a_frame_without_its_pose_is_left_out(tmp_path: Path) -> None:
+    data = transforms(tmp_path)
+    del data["frames"][3]["transform_matrix"]
+    data["frames"][5] = None
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    scene = loaded(tmp_path)
+    check_poses(scene, [0, 1, 2, 4, 6, 7])
+    assert [entry["name"] for entry in scene.report["left_out"]] == ["images/3.png", "frame 5"]
+    with pytest.raises(InputError, match=r"transforms\.json: frame 3 lacks"):
+        loaded(tmp_path, strict=True)
+
+
 LISTED: list[tuple[str, Callable[[str], str]]] = [
     ("backslash", lambda name: f"images\\{name}"),
     ("dot and backslash", lambda name: f".\\images\\{name}"),
