@@ -127,9 +127,12 @@ def _located(folder: Path, model: Model) -> tuple[dict[int, tuple[str, Path]], l
     """View name and photo by image id, and the images that are wrong."""
     names = {number: safe_name(model.names[number], model.path) for number in model.reconstruction.reg_image_ids()}
     root = photo_folder(folder, model.path, list(names.values()))
-    files, located = NamedFiles(root), {}
-    for image_id, name in names.items():
-        photo = files.find(name) or root / "/".join(parts_of(name))
+    files, located, taken = NamedFiles(root), {}, set[Path]()
+    for image_id, name in sorted(names.items(), key=lambda item: not (root / item[1]).is_file()):
+        photo = files.find(name)
+        if photo is None or photo in taken:  # another image has that very name
+            photo = root / "/".join(parts_of(name))
+        taken.add(photo)
         located[image_id] = (safe_name(photo.relative_to(root).as_posix(), model.path), photo)
     wrong = [
         {"name": located.pop(number)[0], "why": why} for number, why in sorted(model.wrong.items()) if number in located

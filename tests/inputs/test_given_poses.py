@@ -157,6 +157,14 @@ def test_names_of_models_hold_blanks_backslashes_and_other_case(spelled: str, su
     assert [view.name for view in scene.views] == [f"cam 1/{name}" for name in NAMES]
 
 
+def test_a_photo_belongs_to_the_image_of_its_very_name(tmp_path: Path) -> None:
+    folder = workspace(tmp_path / "in")
+    write_model(folder / "sparse/0", ["3.PNG", *NAMES[1:]])
+    scene = loaded(folder)
+    check_poses(scene, list(range(1, 8)))
+    assert [entry["name"] for entry in scene.report["left_out"]] == ["3.PNG"]
+
+
 def test_masks_and_labels_are_there_in_other_case(tmp_path: Path) -> None:
     scene = loaded(workspace(tmp_path / "in"))
     for name in NAMES:
