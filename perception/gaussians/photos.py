@@ -15,11 +15,11 @@ from perception.errors import InputError
 from perception.gaussians.views import TrainingView
 from perception.io.documents import text_of
 from perception.io.memory import Keep
-from perception.io.named_files import folded
 from perception.masks.label_files import load_labels
 from perception.photos.decode import load_photo, scaled_K
 from perception.photos.depth import load_depth, without_edges
 from perception.photos.ignore_masks import load_weight
+from perception.photos.named_files import folded
 from perception.progress import Progress
 from perception.types import Scene, View
 

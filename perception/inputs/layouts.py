@@ -16,9 +16,9 @@ from perception.errors import InputError
 from perception.geometry import interpolated_pose
 from perception.inputs.recordings import Frame, Recording
 from perception.io.documents import brief, read_json, text_of
-from perception.io.named_files import NamedFiles
 from perception.photos.decode import open_photo, photo_size
 from perception.photos.lens import opencv_lens
+from perception.photos.named_files import NamedFiles
 from perception.types import Lens
 
 TUM_APART, TUM_GAP = 0.02, 0.1

@@ -17,10 +17,10 @@ from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
 from perception.inputs.far import without_far
 from perception.inputs.start_cloud import start_points
 from perception.io.documents import brief, read_json, safe_name
-from perception.io.named_files import NamedFiles
 from perception.photos.decode import SUFFIXES, photo_size, why_left_out
 from perception.photos.ignore_masks import mask_of
 from perception.photos.lens import FISHEYE, PERSPECTIVE, opencv_lens
+from perception.photos.named_files import NamedFiles
 from perception.photos.view_json import absolute
 from perception.photos.views import first_of, posed_view, rigid_pose
 from perception.sfm.options import NO_CLOUD, ReadOptions

@@ -23,12 +23,12 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.atomic import atomic_file
 from perception.io.documents import safe_name
-from perception.io.named_files import NamedFiles, folded
 from perception.io.ply import write_ply
 from perception.map.checksums import EDITABLE, FACTS, REPORT, facts_of, listed_files, seal, verify
 from perception.map.files import FORMAT_VERSION, MapFiles
 from perception.map.map import Map
 from perception.map.replace import map_directory, writing
+from perception.photos.named_files import NamedFiles, folded
 from perception.photos.view_json import StoredView, moved_record, stored_view, view_from_json, view_json
 from perception.types import View
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.documents import safe_name
-from perception.io.named_files import NamedFiles
 from perception.masks.base import MaskSource
 from perception.masks.label_files import read_labels, read_png_header
+from perception.photos.named_files import NamedFiles
 from perception.types import View
 
 _COLOUR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGB with alpha"}

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.named_files import NamedFiles
 from perception.photos.decode import nearest, photo_size, read_picture, warp_labels
 from perception.photos.lens import same_aspect
+from perception.photos.named_files import NamedFiles
 from perception.types import Scene, View
 
 
