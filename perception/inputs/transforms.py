@@ -81,10 +81,9 @@ def transforms_files(source: Path) -> list[Path]:
     if not source.is_dir():
         return [source] if source.suffix.lower() == ".json" and source.is_file() else []
     found = json_files(source)
-    parts = found[:1] if found and found[0].name == _TRAIN else []
-    return found[:1] + [
-        path for part in parts for path in found[1:] if _PART.match(path.name) and path.parent == part.parent
-    ]
+    if not found or found[0].name != _TRAIN:
+        return found[:1]
+    return [path for path in found if _PART.match(path.name) and path.parent == found[0].parent]
 
 
 def json_files(folder: Path) -> list[Path]:
@@ -103,13 +102,9 @@ def faults(folder: Path) -> list[str]:
 
 
 def _listing_frames(folder: Path) -> list[Path]:
-    found = [
-        path
-        for inside in (folder, folder / "images")
-        for path in sorted(inside.glob("*.json"))
-        if os.access(path, os.R_OK)
-    ]
-    return [path for path in found if path.name == "transforms.json" or _FRAMES.search(path.read_bytes())]
+    found = (path for inside in (folder, folder / "images") for path in sorted(inside.glob("*.json")))
+    readable = (path for path in found if os.access(path, os.R_OK))
+    return [path for path in readable if path.name == "transforms.json" or _FRAMES.search(path.read_bytes())]
 
 
 def _fault(file: Path) -> str | None:
@@ -158,11 +153,11 @@ class _Listing:
     """The files that a JSON file in `folder` lists: below the folder, or for one inside `images` beside that."""
 
     def __init__(self, folder: Path) -> None:
-        self.places = [NamedFiles(folder), *([NamedFiles(folder.parent)] if folder.name == "images" else [])]
+        self.folders = [NamedFiles(folder), *([NamedFiles(folder.parent)] if folder.name == "images" else [])]
 
     def find(self, listed: str) -> Path | None:
         """The file; a photo may be listed without its suffix."""
-        found = (place.find(listed, sorted(SUFFIXES)) for place in self.places)
+        found = (folder.find(listed, sorted(SUFFIXES)) for folder in self.folders)
         return next((path for path in found if path is not None), None)
 
     def needed(self, file: Path, what: str, listed: object) -> Path:
