@@ -40,7 +40,10 @@ class Settings(BaseModel):
 class PhotoConfig(Settings):
     max_side: int = Field(800, ge=16, le=65536, description="pixels of the long side at which the map is trained")
     holdout: int = Field(
-        8, ge=0, le=10**6, description="every N-th photo is kept out of training for scoring; 0: all are trained on"
+        8,
+        ge=0,
+        le=10**6,
+        description="every N-th photo, or the test part of the input, is kept for scoring; 0: all are trained on",
     )
     held_out: str | None = Field(None, description="text file of the photos kept for scoring instead, a name a line")
     camera: str | None = Field(None, description="ROS camera_info YAML: the intrinsics of all photos, kept fixed")
@@ -341,7 +344,7 @@ def read_toml(file: Path) -> dict[str, Any]:
     except ModuleNotFoundError:  # Python 3.10
         import tomli as tomllib  # type: ignore[no-redef,import-not-found]
     try:
-        return tomllib.loads(file.read_text(encoding="utf-8"))
+        return tomllib.loads(file.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror}); give an existing TOML file") from error
     except (ValueError, RecursionError) as error:

@@ -13,6 +13,9 @@ OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Camera axes: OpenGL (x right, y up, z backward) to OpenCV (x right, y down, z forward). Its own inverse."""
 _TOLERANCE = 1e-4
 """Largest deviation of R Rᵀ / s² from the identity: float32 poses pass, shears do not."""
+FAR_GAP = 20.0
+"""Ratio of distances that no path of a camera leaves between two photos: those at a table lie within 2 m, the next one
+across a hall at 10."""
 
 
 def inverse_se3(a_from_b: np.ndarray) -> np.ndarray:
@@ -26,6 +29,20 @@ def inverse_se3(a_from_b: np.ndarray) -> np.ndarray:
 def camera_centres(camera_from_world: np.ndarray) -> np.ndarray:
     """Camera centres [N, 3] in the world frame, of poses camera_from_world [N, 4, 4]."""
     return np.asarray(-np.einsum("nji,nj->ni", camera_from_world[:, :3, :3], camera_from_world[:, :3, 3]))
+
+
+def far_from_most(centres: np.ndarray, scale: float = 0.0) -> np.ndarray:
+    """[N] bool, true for centres [N, 3] beyond a gap around all others: in order of their distance from the median
+    centre, from the first of the farthest quarter that lies FAR_GAP times as far as the one before it, and as `scale`
+    (the distance of what the cameras see; 0 = unknown). A camera that drives away leaves no gap."""
+    distance = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
+    order = np.argsort(distance, kind="stable")
+    outer = np.arange(max(len(order) - len(order) // 4, 2), len(order))
+    before = np.maximum(distance[order[outer - 1]], scale)
+    gaps = outer[(before > 0) & (distance[order[outer]] > FAR_GAP * before)]
+    far = np.zeros(len(order), bool)
+    far[order[gaps[0] if len(gaps) else len(order) :]] = True
+    return far
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 class Lens:
     """The camera that took a photo, as COLMAP names it: model (e.g. "OPENCV"), params in COLMAP's order.
 
-    width, height: size in pixels of the photo after EXIF rotation.
+    width, height: size in pixels of the photo as its view uses it (see `View.as_stored`).
     """
 
     model: str
@@ -40,9 +40,11 @@ class View:
     name: file name of the photo relative to its folder, unique in the scene ("a/0001.jpg").
     photo: path of the photo. lens: None when the photo is already a pinhole image of size width × height.
     K: [3, 3] float64, pixels. camera_from_world: [4, 4] float64, OpenCV axes (x right, y down, z forward).
-    held_out: whether the view was used for evaluation of a finished map and not for training. depth: None without a
-    depth sensor. mask: image of pixels to ignore (black), of the photo's shape at any resolution; None uses all.
-    gain: colours of the photo over those of the scene, RGB, where exposure or white balance vary; None = 1.
+    held_out: whether the view was used for evaluation of a finished map and not for training; of an input: whether it
+    keeps the photo for that. depth: None without a depth sensor. mask: image of pixels to ignore (black), of the
+    photo's shape at any resolution; None uses all. gain: colours of the photo over those of the scene, RGB, where
+    exposure or white balance vary; None = 1. as_stored: whether the photo's pixels are used without EXIF rotation, as
+    tools that know poses use them.
     """
 
     name: str
@@ -56,6 +58,7 @@ class View:
     depth: DepthImage | None = None
     mask: Path | None = None
     gain: tuple[float, float, float] | None = None
+    as_stored: bool = False
 
     @property
     def photo_size(self) -> tuple[int, int]:

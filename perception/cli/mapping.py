@@ -98,7 +98,7 @@ _SHORTCUTS = {
     "train.iterations": ("N", None),
     "train.time_limit": ("S", "seconds of training; all schedules shrink to fit"),
     "photos.memory": ("SIZE", "such as 8G: memory for photos, labels and depth; what does not fit is on disk"),
-    "photos.holdout": ("N", "every N-th view is kept for scoring, 0 trains on all"),
+    "photos.holdout": ("N", "every N-th view, or the input's test part, is kept for scoring, 0 trains on all"),
     "seed": ("S", None),
     "device": ("DEVICE", "auto, cpu or cuda"),
 }

@@ -76,7 +76,7 @@ def read_transform(path: Path) -> np.ndarray:
     """map_from_scan [4, 4] float64: four rows of four numbers as text or JSON, or a JSON object that holds them as
     `map_from_scan`, as `export` writes. InputError unless it is a rotation, a positive scale and a translation."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
         if text.lstrip()[:1] in ("[", "{"):
             rows = json.loads(text)
             rows = rows["map_from_scan"] if isinstance(rows, dict) else rows

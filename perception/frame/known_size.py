@@ -50,7 +50,7 @@ def scale_of_tags(views: Sequence[View], size: float) -> Measurement:
         detector = cv2.aruco.ArucoDetector(dictionary, parameters)
         seen: dict[int, Sighting] = {}
         for number, view in enumerate(views):
-            picture = read_grey(view.photo)
+            picture = read_grey(view.photo, view.as_stored)
             corners, ids, _ = detector.detectMarkers(picture)
             for tag, pixels in zip(map(int, () if ids is None else np.ravel(ids)), corners, strict=True):
                 sighting = seen.setdefault(tag, Sighting(square, np.full((len(views), 4, 2), np.nan)))
@@ -69,7 +69,9 @@ def scale_of_tags(views: Sequence[View], size: float) -> Measurement:
 
 def scale_of_board(views: Sequence[View], board: Board) -> Measurement:
     """Metres per unit from a calibration board; InputError when it is not seen in two photos."""
-    detected = ((number, board.detect(view.name, read_grey(view.photo))) for number, view in enumerate(views))
+    detected = (
+        (number, board.detect(view.name, read_grey(view.photo, view.as_stored))) for number, view in enumerate(views)
+    )
     found = {number: detection for number, detection in detected if detection is not None}
     if len(found) < 2:
         raise InputError(f"board: the {board} is seen in {len(found)} of {len(views)} photos, at least 2 are needed")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from perception.geometry import camera_centres, check_similarity, move_points, scale_of
+from perception.geometry import camera_centres, check_similarity, far_from_most, move_points, scale_of
 from perception.types import Scene, View
 
 FAR = 100.0
@@ -21,7 +21,8 @@ def recentred(scene: Scene) -> Scene:
     """The scene, moved to its centre if it is far from the origin."""
     centres = camera_centres(np.stack([view.camera_from_world for view in scene.views]))
     middle = np.median(centres, axis=0)
-    extent = float(np.linalg.norm(centres - middle, axis=1).max())
+    distances = np.linalg.norm(centres - middle, axis=1)
+    extent = float(distances[~far_from_most(centres)].max())
     if extent == 0 or np.linalg.norm(middle) <= FAR * extent:
         return scene
     shift = np.eye(4)

@@ -13,11 +13,13 @@ import torch
 from perception.config import PhotoConfig
 from perception.errors import InputError
 from perception.gaussians.views import TrainingView
+from perception.io.documents import text_of
 from perception.io.memory import Keep
 from perception.masks.label_files import load_labels
 from perception.photos.decode import load_photo, scaled_K
 from perception.photos.depth import load_depth, without_edges
 from perception.photos.ignore_masks import load_weight
+from perception.photos.named_files import folded
 from perception.progress import Progress
 from perception.types import Scene, View
 
@@ -25,15 +27,18 @@ from perception.types import Scene, View
 def split_scene(scene: Scene, options: PhotoConfig) -> tuple[Scene, list[View], list[View]]:
     """(the scene with its views sorted by name, training views, held-out views as exposed as their neighbours).
 
-    Held out are the views that the file `options.held_out` names, or every `options.holdout`-th: none with a holdout of
-    1 or 0, or of fewer than 4 views. InputError for a file that cannot be read or leaves no view to train on.
+    Held out are the views that the file `options.held_out` names, or those that the input sets apart, or every
+    `options.holdout`-th: none with a holdout of 1 or 0, or of fewer than 4 views. InputError for a file that cannot be
+    read or leaves no view to train on.
     """
     views, listed, every = scene.views, options.held_out, options.holdout
     if listed is not None:
         names = _names(Path(listed))
-        held = [bool(names & {view.name, PurePosixPath(view.name).stem}) for view in views]
+        held = [bool(names & {folded(view.name), folded(PurePosixPath(view.name).stem)}) for view in views]
         if all(held):
             raise InputError(f"{listed}: names all {len(views)} photos; some must be left to train on")
+    elif every > 1 and 0 < sum(view.held_out for view in views) < len(views):
+        held = [view.held_out for view in views]
     else:
         held = [every > 1 and len(views) >= 4 and index % every == 0 for index in range(len(views))]
     training = list(compress(views, [not is_held for is_held in held]))
@@ -43,7 +48,7 @@ def split_scene(scene: Scene, options: PhotoConfig) -> tuple[Scene, list[View], 
 
 def _names(listed: Path) -> set[str]:
     try:
-        return {line.strip() for line in listed.read_text(encoding="utf-8").splitlines() if line.strip()}
+        return {folded(line.strip()) for line in text_of(listed.read_bytes()).splitlines() if line.strip()}
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{listed}: cannot be read; expected a text file of photo names, one a line") from error
 

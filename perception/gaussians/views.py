@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from perception.gaussians.model import Gaussians
+from perception.geometry import far_from_most
 from perception.io.memory import Keep
 from perception.rasterizer.rasterize import rasterizer_for
 from perception.rasterizer.types import Forward, Settings
@@ -102,9 +103,11 @@ def unprojected(K: np.ndarray, pose: np.ndarray, x: np.ndarray, y: np.ndarray, d
 
 
 def scene_extent(views: list[TrainingView]) -> float:
-    """1.1 × the largest distance of a camera from the mean camera centre (Kerbl et al. 2023), at least 1e-3."""
+    """1.1 × the largest distance of a camera from the mean camera centre (Kerbl et al. 2023), at least 1e-3.
+    Cameras `far_from_most` do not count."""
     poses = torch.stack([view.camera_from_world for view in views])
     centres = -torch.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    centres = centres[torch.from_numpy(~far_from_most(centres.double().numpy()))]
     return max(1.1 * float((centres - centres.mean(dim=0)).norm(dim=1).max()), 1e-3)
 
 

@@ -1,64 +1,143 @@
-"""COLMAP workspaces: `images/` beside `sparse/0`, `sparse/*` or `sparse`, binary or text, any undistortable camera.
-
-pycolmap does not check counts and string ends, so a damaged binary file can make it loop for ever or take all memory.
-Here each file is read once before, and damage is reported by file and record. Layout: COLMAP's documentation, "Output
-Format"; little endian. Rigs and frames came with COLMAP 3.12.
-"""
+"""COLMAP models and their photos, in any of the folders in which programs leave them."""
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from pathlib import Path
-from struct import Struct
 from typing import Any
 
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.documents import brief, safe_name
-from perception.photos.lens import load_pycolmap
+from perception.inputs.colmap_files import Model, names_in, read_model
+from perception.inputs.far import without_far
+from perception.io.documents import safe_name
+from perception.photos.folder import folders_below, list_photos
+from perception.photos.named_files import NamedFiles, parts_of
+from perception.photos.views import first_of
 from perception.sfm.model import cloud_of, views_of_model
 from perception.sfm.options import ReadOptions
 from perception.sfm.triangulate import MIN_POINTS, posed_scene
 from perception.types import Scene
 
-_PARAMS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
-"""Number of parameters of a camera, by COLMAP's model id."""
-_LONGEST_NAME = 4096
-_HEADS = {  # of a record, up to its first name or list; where a list follows at once, the last number is its length
-    "cameras": Struct("<IiQQ"),  # id, model, width, height
-    "images": Struct("<I7dI"),  # id, pose, camera
-    "points3D": Struct("<Q3d3BdQ"),
-    "rigs": Struct("<II"),
-    "frames": Struct("<II7dI"),  # id, rig, pose
-}
-_COUNT, _FLAG, _SENSOR, _POSE = Struct("<Q"), Struct("<B"), Struct("<iI"), Struct("<7d")
+DEPTH = 3
+"""Folders below the input in which models are looked for, and photos one less: "colmap/sparse/0" and "dslr/images"."""
+LOOKED_AT = 200
+SHARED = 15
+"""Least number of points that a photo far from all others must share with them: half of the inliers that COLMAP asks of
+a pose."""
+_SPARSE, _DISTORTED, _PHOTOS = "sparse", "distorted", ("images", "input")
 
 
 def is_workspace(folder: Path) -> bool:
-    """True for a folder with photos in `images/` and a sparse model."""
-    return (folder / "images").is_dir() and bool(_models(folder))
+    """True for a folder that holds a sparse model somewhere."""
+    return bool(models_below(folder))
+
+
+def models_below(folder: Path) -> list[Path]:
+    """The folders with a sparse model, in order of preference: in `sparse`, then by depth and name. Models in one
+    `sparse` are parts of one reconstruction, or its attempts."""
+    if not folder.is_dir():
+        return []
+    found = []
+    for path in folders_below(folder, DEPTH):
+        inside = path.relative_to(folder).parts
+        if any((path / f"images.{kind}").is_file() for kind in ("bin", "txt")):
+            in_sparse = _SPARSE in inside[-2:]
+            has_cameras = any((path / f"cameras.{kind}").is_file() for kind in ("bin", "txt"))
+            if in_sparse or (has_cameras and len(inside) < DEPTH):
+                found.append((inside[:1] != (_SPARSE,), len(inside), path))
+    return [path for *_, path in sorted(found)]
+
+
+def model_files(folder: Path) -> list[Path]:
+    """The files of all sparse models of a workspace."""
+    files = (file for model in models_below(folder) for file in model.iterdir())
+    return [file for file in files if file.suffix in (".bin", ".txt") and file.is_file()]
+
+
+def model_photos(folder: Path) -> list[Path]:
+    """The photos of the preferred models of a workspace that exist; of a damaged model all those in `images`."""
+    parts, images = _preferred(folder), folder / _PHOTOS[0]
+    try:
+        names = sorted({name for path in parts for name in names_in(path)})
+    except InputError:
+        return list_photos(images) if images.is_dir() else []
+    files = NamedFiles(photo_folder(folder, parts[0], names))
+    return [path for path in map(files.find, names) if path is not None]
+
+
+def photo_folder(folder: Path, model: Path, names: Sequence[str]) -> Path:
+    """The folder that holds most photos of a model: `images`, `input` (first for `distorted`) or the input itself where
+    one of them holds half, else any folder below. Some of the names are tried, LOOKED_AT at most."""
+    names = names[:: -(-len(names) // LOOKED_AT) or 1]
+    usual = [folder / name for name in _PHOTOS]
+    usual = usual[::-1] if _DISTORTED in model.relative_to(folder).parts else usual
+    best, most = usual[0], 0
+    for path in [*usual, folder, *folders_below(folder, DEPTH - 1)]:
+        files = NamedFiles(path)
+        held = sum(files.find(name) is not None for name in names) if path.is_dir() else 0
+        if held > most:
+            best, most = path, held
+        if held == len(names) or (path == folder and 2 * most >= len(names)):
+            break
+    return best
 
 
 def read_workspace(folder: Path, options: ReadOptions) -> Scene:
-    """The largest sparse model of a workspace as a Scene, in COLMAP's world.
-    Photos that are missing or damaged are left out and reported. Image names that point outside the photo folder raise
-    InputError."""
-    found = {path: _read_model(path) for path in _models(folder)}
-    path, model = max(found.items(), key=lambda item: item[1].num_reg_images())
-    if model.num_reg_images() == 0:
+    """The preferred sparse model of a workspace as a Scene, in COLMAP's world.
+    Photos that are missing or damaged, or whose pose or camera is not finite, are left out and reported. Image names
+    that point outside the photo folder raise InputError."""
+    paths, models = models_below(folder), [read_model(path) for path in _preferred(folder)]
+    model = max(models, key=lambda model: model.reconstruction.num_reg_images())
+    path, reconstruction = model.path, model.reconstruction
+    if reconstruction.num_reg_images() == 0:
         raise InputError(f"{path}: the sparse model is empty (no registered photo); run structure from motion again")
-    names = {image_id: safe_name(model.images[image_id].name, path) for image_id in model.reg_image_ids()}
-    located = {image_id: (name, folder / "images" / name) for image_id, name in names.items()}
-    views, facts = views_of_model(model, located, path, options)
-    if len(found) > 1:
-        sizes = ", ".join(f"{p.name}: {m.num_reg_images()}" for p, m in found.items())
-        facts["warnings"].append(f"{folder}: {len(found)} sparse models (photos in {sizes}); the largest is used")
-    cloud = options.cloud or cloud_of(model)
+    located, wrong = _located(folder, model)
+    if wrong and (options.strict or not located):
+        raise InputError(f"{path}: {len(wrong)} of {len(model.names)} photos cannot be used{first_of(wrong)}")
+    views, facts = views_of_model(reconstruction, located, path, options, upright=False)
+    facts["left_out"] = sorted([*facts["left_out"], *wrong], key=lambda entry: entry["name"])
+    if len(paths) > 1:
+        sizes = {model.path: f" ({model.reconstruction.num_reg_images()} photos)" for model in models}
+        others = ", ".join(f"{other.relative_to(folder)}{sizes.get(other, '')}" for other in paths if other != path)
+        used = f"{path.relative_to(folder)}{sizes[path]}"
+        facts["warnings"].append(f"{folder}: {len(paths)} sparse models; {used} is used, not {others}")
+    observed = {name: reconstruction.images[image_id].num_points3D for image_id, (name, _) in located.items()}
+    cloud = options.cloud or cloud_of(reconstruction)
+    near = [view.name for view in views if observed[view.name] >= SHARED]
+    views, far = without_far(views, cloud[0], set(near), options.strict, path)
+    facts["left_out"] += far
     if len(cloud[0]) < MIN_POINTS:
         facts["warnings"].append(f"{path}: the sparse model holds {len(cloud[0])} points; new ones are triangulated")
-    facts |= {"model": path.relative_to(folder).as_posix(), "mean_reprojection_error_px": _reprojection_error(model)}
+    error = _reprojection_error(reconstruction)
+    facts["notes"] = [f"poses of {folder}: COLMAP model {path.relative_to(folder)}"]
+    facts |= {"model": path.relative_to(folder).as_posix(), "mean_reprojection_error_px": error}
     return posed_scene(views, cloud, {"input": "colmap", **facts}, options, MIN_POINTS)
+
+
+def _preferred(folder: Path) -> list[Path]:
+    """The first model of a workspace, and the others in the same `sparse`."""
+    paths = models_below(folder)
+    bases = [path.parent if path.parent.name == _SPARSE else path for path in paths]
+    return [path for path, base in zip(paths, bases, strict=True) if base == bases[0]]
+
+
+def _located(folder: Path, model: Model) -> tuple[dict[int, tuple[str, Path]], list[dict[str, str]]]:
+    """View name and photo by image id, and the images that are wrong."""
+    names = {number: safe_name(model.names[number], model.path) for number in model.reconstruction.reg_image_ids()}
+    root = photo_folder(folder, model.path, list(names.values()))
+    files, located, taken = NamedFiles(root), {}, set[Path]()
+    for image_id, name in sorted(names.items(), key=lambda item: not (root / item[1]).is_file()):
+        photo = files.find(name)
+        if photo is None or photo in taken:  # another image has that very name
+            photo = root / "/".join(parts_of(name))
+        taken.add(photo)
+        located[image_id] = (safe_name(photo.relative_to(root).as_posix(), model.path), photo)
+    wrong = [
+        {"name": located.pop(number)[0], "why": why} for number, why in sorted(model.wrong.items()) if number in located
+    ]
+    return located, wrong
 
 
 def _reprojection_error(model: Any) -> float | None:
@@ -68,100 +147,3 @@ def _reprojection_error(model: Any) -> float | None:
     model.update_point_3d_errors()
     error = float(model.compute_mean_reprojection_error())
     return error if np.isfinite(error) else None
-
-
-def _models(folder: Path) -> list[Path]:
-    sparse = folder / "sparse"
-    if not sparse.is_dir():
-        return []
-    inside = sorted(path for path in sparse.iterdir() if path.is_dir())
-    return [path for path in [sparse, *inside] if any((path / f"images.{kind}").is_file() for kind in ("bin", "txt"))]
-
-
-def model_files(folder: Path) -> list[Path]:
-    """The files of all sparse models of a workspace."""
-    files = (file for model in _models(folder) for file in model.iterdir())
-    return [file for file in files if file.suffix in (".bin", ".txt") and file.is_file()]
-
-
-def _read_model(path: Path) -> Any:
-    suffix = ".bin" if (path / "images.bin").is_file() else ".txt"
-    needed = [f"{stem}{suffix}" for stem in ("cameras", "images", "points3D")]
-    absent = [name for name in needed if not (path / name).is_file()]
-    if absent:
-        raise InputError(f"{path}: the sparse model lacks {', '.join(absent)}")
-    if suffix == ".bin":
-        check_binary_model(path)
-    else:
-        _refuse_nan_text(path)
-    try:
-        return load_pycolmap().Reconstruction(path)
-    except (ValueError, RuntimeError, LookupError, TypeError) as error:
-        raise InputError(f"{path}: not a readable COLMAP model ({brief(error)})") from error
-
-
-def _refuse_nan_text(path: Path) -> None:
-    """InputError naming the file for NaN poses in a text model, on which COLMAP may abort the process."""
-    file = path / "images.txt"
-    for fields in map(str.split, file.read_text(errors="replace").splitlines()):
-        if len(fields) == 10 and any(value.lower().lstrip("+-") in ("nan", "inf") for value in fields[1:8]):
-            raise InputError(f"{file}: the pose of {fields[9]} is not finite (NaN); repair or remove that photo")
-
-
-def check_binary_model(folder: Path) -> None:
-    """InputError naming the first file and record that is not valid."""
-    heads = {kind: _heads(folder / f"{kind}.bin", kind) for kind in _HEADS}
-    known = {camera for camera, _ in heads["cameras"]}
-    for image, camera in heads["images"]:
-        if camera not in known:
-            raise InputError(f"{folder / 'images.bin'}: image {image} has camera {camera}, which cameras.bin lacks")
-
-
-def _heads(file: Path, kind: str) -> list[tuple[int, int]]:
-    """First and last number of each record's head; [] if the file does not exist. InputError for an id that repeats."""
-    if not file.is_file():
-        return []
-    data, at, found = file.read_bytes(), 0, list[tuple[int, int]]()
-
-    def take(layout: Struct) -> tuple:
-        skip(1, layout.size)
-        return layout.unpack_from(data, at - layout.size)
-
-    def skip(count: int, size: int) -> None:
-        nonlocal at
-        at += count * size
-        if at > len(data):
-            raise ValueError("the file is cut short")
-
-    try:
-        for _ in range(take(_COUNT)[0]):
-            head = take(_HEADS[kind])
-            pose = head[1:8] if kind == "images" else head[2:9] if kind == "frames" else (1.0,)
-            if not all(map(math.isfinite, pose)) or not any(pose[:4]):
-                raise ValueError(f"the pose of {kind[:-1]} {head[0]} is not finite, or no rotation")
-            if kind == "cameras":
-                if not 0 <= head[1] < len(_PARAMS) or max(head[2:]) > 1 << 30:
-                    raise ValueError(f"camera {head[0]} of model {head[1]} and {head[2]}×{head[3]} pixels")
-                if not all(map(math.isfinite, take(Struct(f"<{_PARAMS[head[1]]}d")))):
-                    raise ValueError(f"camera {head[0]} has a parameter that is not finite")
-            elif kind == "images":
-                end = data.find(b"\0", at, at + _LONGEST_NAME)
-                if end < 0:
-                    raise ValueError("its name has no end")
-                data[at:end].decode("utf-8")
-                skip(end + 1 - at, 1)
-                skip(take(_COUNT)[0], 24)
-            elif kind == "rigs":
-                for number in range(head[1]):
-                    take(_SENSOR)
-                    if number and take(_FLAG)[0]:
-                        take(_POSE)
-            else:
-                skip(head[-1], 8 if kind == "points3D" else 16)
-            found.append((head[0], head[-1]))
-        if len({head[0] for head in found}) != len(found):
-            raise ValueError("an id occurs twice")
-    except ValueError as error:
-        what = f"what follows {len(found)} good records cannot be right ({error})"
-        raise InputError(f"{file}: {what}; the model is damaged") from error
-    return found

@@ -5,6 +5,7 @@ All write pixel centres at whole numbers, so 0.5 is added to their principal poi
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,9 +15,10 @@ from scipy.spatial.transform import Rotation
 from perception.errors import InputError
 from perception.geometry import interpolated_pose
 from perception.inputs.recordings import Frame, Recording
-from perception.io.documents import brief, read_json
+from perception.io.documents import brief, read_json, text_of
 from perception.photos.decode import open_photo, photo_size
 from perception.photos.lens import opencv_lens
+from perception.photos.named_files import NamedFiles
 from perception.types import Lens
 
 TUM_APART, TUM_GAP = 0.02, 0.1
@@ -29,6 +31,7 @@ _TUM_LENSES = {  # fx fy cx cy k1 k2 p1 p2 k3, from the data set's page on calib
 _PRIMESENSE = (525.0, 525.0, 319.5, 239.5)  # the intrinsics that Redwood and Open3D assume for 640 × 480 pixels
 _KINECT_DEPTH, _KINECT_COLOR = (585.0, 585.0, 320.0, 240.0), (525.0, 525.0, 320.0, 240.0)
 _SIZE = (640, 480)
+_COMMA = re.compile(r"[+-]?\d+,\d+(e[+-]?\d+)?", re.IGNORECASE)
 _TEXTS = (
     *("rgb.txt", "depth.txt", "groundtruth.txt", "pose/*.txt", "intrinsic/*.txt", "frame-*.pose.txt"),
     *("seq*/frame-*.pose.txt", "camera-intrinsics.txt", "*.log", "*intrinsic*.json", "camera*.json"),
@@ -86,6 +89,7 @@ def _tum(source: Path) -> Recording:
         raise InputError(f"{truth}: missing, so depth has no poses; expected lines 'time tx ty tz qx qy qz qw'")
     (at, photos), (depth_at, depths) = (_listed(source / name) for name in ("rgb.txt", "depth.txt"))
     rows = _numbers(truth, 8)
+    rows = rows[np.isfinite(rows[:, :8]).all(axis=1)]  # where tracking was lost
     times, shifts, quaternions = np.split(rows[np.argsort(rows[:, 0], kind="stable"), :8], [1, 4], axis=1)
     if (np.linalg.norm(quaternions, axis=1) < 1e-6).any():
         raise InputError(f"{truth}: a quaternion is zero; expected lines 'time tx ty tz qx qy qz qw'")
@@ -96,11 +100,14 @@ def _tum(source: Path) -> Recording:
     if apart.min() > TUM_APART:
         found = f"photos and depth are at least {apart.min():.3g} s apart, at most {TUM_APART} are allowed"
         raise InputError(f"{source}: {found}; do rgb.txt and depth.txt use one clock?")
+    if not any(photos):
+        raise InputError(f"{source / 'rgb.txt'}: none of the {len(photos)} photos that it lists is there")
     frames = []
     for time, photo, depth, near in zip(at, photos, nearest, apart <= TUM_APART, strict=True):
         pose = interpolated_pose(times, poses, time, TUM_GAP)
-        if pose is not None and (source / photo).is_file():
-            frames.append(Frame(photo, source / photo, source / depths[depth] if near else None, pose))
+        if pose is not None and photo is not None:
+            name = photo.relative_to(source).as_posix()
+            frames.append(Frame(name, photo, depths[depth] if near else None, pose))
     if not frames:
         raise InputError(
             f"{source}: no photo lies between two poses; photos are from {at.min():.3f} to {at.max():.3f} s, poses "
@@ -112,13 +119,15 @@ def _tum(source: Path) -> Recording:
     return Recording(source, "TUM RGB-D", frames, lens, 5000.0, None, notes)
 
 
-def _listed(file: Path) -> tuple[np.ndarray, list[str]]:
-    """Times [N] in ascending order, and the files."""
+def _listed(file: Path) -> tuple[np.ndarray, list[Path | None]]:
+    """Times [N] in ascending order, and the files, None where they are missing."""
+    files = NamedFiles(file.parent)
     try:
-        rows = sorted(((float(row[0]), row[1]) for row in _rows(file)), key=lambda row: row[0])
+        rows = sorted(((float(row[0]), row[1:]) for row in _rows(file)), key=lambda row: row[0])
+        found = [files.find(name[0]) or files.find(" ".join(name)) for _, name in rows]
     except (ValueError, IndexError) as error:
         raise InputError(f"{file}: expected lines 'time file' ({error})") from error
-    return np.array([time for time, _ in rows]), [name for _, name in rows]
+    return np.array([time for time, _ in rows]), found
 
 
 def _scannet(source: Path) -> Recording:
@@ -155,15 +164,16 @@ def _seven_scenes(source: Path) -> Recording:
 def _posed(source: Path, photos: list[Path], beside: Callable[[Path, str], Path]) -> list[Frame]:
     """The photos with a pose, a file of world_from_camera that is neither infinite nor all zero (tracking was lost).
     beside: the photo's file of kind "depth" (.png) or "pose" (.txt), without suffix."""
-    frames = []
+    frames, files = [], NamedFiles(source)
     for photo in photos:
-        depth, pose = (Path(f"{beside(photo, kind)}{suffix}") for kind, suffix in (("depth", ".png"), ("pose", ".txt")))
-        matrix = _numbers(pose, 4) if pose.is_file() else np.zeros((4, 4))
+        stems = (beside(photo, kind).relative_to(source) for kind in ("depth", "pose"))
+        depth, pose = (files.find(f"{stem}{end}") for stem, end in zip(stems, (".png", ".txt"), strict=True))
+        matrix = _numbers(pose, 4) if pose is not None else np.zeros((4, 4))
         if matrix.shape != (4, 4):
             raise InputError(f"{pose}: {len(matrix)} rows, expected a 4×4 matrix world_from_camera")
         if np.isfinite(matrix).all() and matrix[:3, :3].any():
             name = photo.relative_to(source).as_posix()
-            frames.append(Frame(name, photo, depth if depth.is_file() else None, matrix))
+            frames.append(Frame(name, photo, depth, matrix))
     return frames
 
 
@@ -213,8 +223,9 @@ def _images(folder: Path) -> list[Path]:
 
 def _numbers(file: Path, columns: int) -> np.ndarray:
     """[N, at least `columns`] float64."""
+    rows = _rows(file)
     try:
-        table = np.array(_rows(file), np.float64)
+        table = np.array(rows, np.float64)
         if table.shape[1] < columns:
             raise ValueError(f"found {table.shape[1]}")
     except ValueError as error:
@@ -223,12 +234,16 @@ def _numbers(file: Path, columns: int) -> np.ndarray:
 
 
 def _rows(file: Path) -> list[list[str]]:
-    """The fields of each line that is not empty and no comment; InputError where there is none."""
+    """The fields of each line that is not empty and no comment, parted by blanks or commas. InputError where there is
+    none, and for decimal commas."""
     try:
-        lines = file.read_text(encoding="utf-8").splitlines()
+        lines = text_of(file.read_bytes()).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{file}: cannot be read as text") from error
-    rows = [row for line in lines if (row := line.replace(",", " ").split()) and not row[0].startswith("#")]
+    lines = [line for line in lines if not line.lstrip().startswith("#")]
+    if commas := [field for line in lines for field in line.split() if _COMMA.fullmatch(field) and field != line]:
+        raise InputError(f"{file}: {commas[0]} has a decimal comma; write it with decimal points")
+    rows = [row for line in lines if (row := line.replace(",", " ").split())]
     if not rows:
         raise InputError(f"{file}: is empty")
     return rows

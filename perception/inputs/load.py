@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from perception.errors import InputError
-from perception.inputs.readers import PhotoSizes, reader_of
+from perception.inputs.readers import PhotoSizes, other_inputs, reader_of
 from perception.inputs.start_cloud import check_seen, start_points
 from perception.photos.camera_file import read_camera
 from perception.photos.ignore_masks import with_checked_masks
@@ -17,8 +17,9 @@ from perception.types import Scene
 
 def load_scene(source: Path, options: ReadOptions) -> Scene:
     """Posed views of `source`, sorted by name, with a sparse cloud.
-    A folder is read as a COLMAP workspace if it is one, else by its transforms.json if it has one, else as an RGB-D
-    recording if it has the layout of one, else as photos, with poses from structure from motion (see `readers`)."""
+    A folder is read by its COLMAP model if it has one, else by its transforms.json or another JSON with frames, else as
+    an RGB-D recording if it has the layout of one, else as photos, with poses from structure from motion (see
+    `readers`). What it holds besides is noted."""
     started = time.perf_counter()
     reader, camera, cloud, masks = reader_of(source), options.camera, options.init_points, options.masks
     if camera is not None and reader.cameras:
@@ -31,6 +32,7 @@ def load_scene(source: Path, options: ReadOptions) -> Scene:
     options = replace(options, lens=lens, cloud=start)
     options.workdir.mkdir(parents=True, exist_ok=True)
     scene = reader.read(source, options)
+    scene.report["notes"] = [*other_inputs(source, reader), *scene.report.get("notes", [])]
     if cloud is not None:
         scene.report["points_from"] = str(cloud)
         check_seen(scene, cloud)

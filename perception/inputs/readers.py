@@ -5,17 +5,25 @@ from __future__ import annotations
 import contextlib
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from perception.errors import InputError
 from perception.inputs import recordings
-from perception.inputs.colmap import is_workspace, model_files, read_workspace
+from perception.inputs.colmap import is_workspace, model_files, model_photos, models_below, read_workspace
 from perception.inputs.layouts import layout_of, open_recording, refuse_depth_without_poses, text_files
-from perception.inputs.transforms import is_transforms, listed_files, listed_photos, read_transforms, transforms_file
+from perception.inputs.transforms import (
+    faults,
+    json_files,
+    listed_files,
+    listed_photos,
+    read_transforms,
+    transforms_files,
+)
 from perception.photos import video
 from perception.photos.decode import photo_size
 from perception.photos.folder import VIDEO_SUFFIXES, list_photos
+from perception.photos.views import fit_lens
 from perception.sfm.options import ReadOptions
 from perception.sfm.reconstruct import reconstruct
 from perception.types import Scene
@@ -35,10 +43,11 @@ class PhotoSizes:
 
 @dataclass(frozen=True)
 class Reader:
-    """A kind of input. recognises: whether a path is one, from names alone. sizes: of its photos, from their headers.
+    """A kind of input. name: for messages. recognises: whether a path is one. sizes: of its photos, from their headers.
     files: all that the scene may come from. read: the Scene. poses, cameras: whether the input brings poses, and the
     intrinsics of its photos."""
 
+    name: str
     recognises: Callable[[Path], bool]
     sizes: Callable[[Path], PhotoSizes]
     files: Callable[[Path], list[Path]]
@@ -69,7 +78,7 @@ def _read_video(source: Path, options: ReadOptions) -> Scene:
     new = not folder.exists()
     record = video.video_frames(source, folder, options.progress)
     try:
-        scene = reconstruct(folder, options)
+        scene = _reconstructed(folder, options)
     except InputError:
         if new:
             shutil.rmtree(folder, ignore_errors=True)
@@ -93,28 +102,42 @@ def _recording_files(source: Path) -> list[Path]:
 
 def _read_photos(source: Path, options: ReadOptions) -> Scene:
     refuse_depth_without_poses(source)
-    return reconstruct(source, options)
+    return _reconstructed(source, options)
+
+
+def _reconstructed(folder: Path, options: ReadOptions) -> Scene:
+    """`reconstruct`, with the lens of a camera file scaled to the photos where they were resized."""
+    if (lens := options.lens) is None:
+        return reconstruct(folder, options)
+    for photo in list_photos(folder):
+        with contextlib.suppress(InputError):
+            lens = fit_lens(lens, photo, as_stored=False) or lens
+            break
+    return reconstruct(folder, replace(options, lens=lens))
 
 
 READERS = (
-    Reader(_is_video, _video_sizes, lambda source: [source], _read_video, poses=False, cameras=False),
+    Reader("video", _is_video, _video_sizes, lambda source: [source], _read_video, poses=False, cameras=False),
     Reader(
+        "COLMAP model",
         is_workspace,
-        lambda source: _sizes(list_photos(source / "images")),
-        lambda source: [*list_photos(source / "images"), *model_files(source)],
+        lambda source: _sizes(model_photos(source)),
+        lambda source: [*model_photos(source), *model_files(source)],
         read_workspace,
         poses=True,
         cameras=True,
     ),
     Reader(
-        is_transforms,
-        lambda source: _sizes(*listed_photos(transforms_file(source))),
-        lambda source: listed_files(transforms_file(source)),
-        lambda source, options: read_transforms(transforms_file(source), options),
+        "JSON with frames",
+        lambda source: bool(transforms_files(source)),
+        lambda source: _sizes(*listed_photos(source)),
+        listed_files,
+        read_transforms,
         poses=True,
         cameras=True,
     ),
     Reader(
+        "RGB-D recording",
         lambda source: layout_of(source) is not None,
         _recording_sizes,
         _recording_files,
@@ -123,13 +146,25 @@ READERS = (
         cameras=False,
     ),
     Reader(
-        Path.is_dir, lambda source: _sizes(list_photos(source)), list_photos, _read_photos, poses=False, cameras=False
+        "photos",
+        Path.is_dir,
+        lambda source: _sizes(list_photos(source)),
+        list_photos,
+        _read_photos,
+        poses=False,
+        cameras=False,
     ),
 )
 EXPECTED = (
     "a folder of photos, a video, a COLMAP workspace, a transforms.json or an RGB-D recording (TUM, ScanNet, 7-Scenes, "
     "3DMatch, Redwood)"
 )
+UNREAD = (
+    *("*.nvm", "bundle*.out", "cameras.xml", "cameras.sfm", "sfm_data.json", "poses_bounds.npy", "reconstruction.json"),
+    *("cameras.json", "model.tsv", "*.rsproj", "*.psx"),
+)
+"""Files of other programs that hold poses of photos and are not read: Bundler, Metashape, Meshroom, OpenMVG, LLFF,
+OpenSfM, Gaussian splatting, RealityScan."""
 
 
 def reader_of(source: Path) -> Reader:
@@ -140,3 +175,25 @@ def reader_of(source: Path) -> Reader:
     if found is None:
         raise InputError(f"{source}: expected {EXPECTED}")
     return found
+
+
+def other_inputs(source: Path, reader: Reader) -> list[str]:
+    """A line on what folder `source`, read by `reader`, holds besides, and one on poses that lie beside it."""
+    if not source.is_dir():
+        return []
+    kinds = [reader.name for reader in READERS]
+    lines = [f"its poses are not read: {fault}" for fault in faults(source)]
+    used = transforms_files(source) if reader.name == kinds[2] else []
+    others = [path.relative_to(source).as_posix() for path in json_files(source) if path not in used]
+    if reader.name in kinds[1:3] and layout_of(source) is not None:
+        others.append(f"an {kinds[3]}")
+    others += [path.name for pattern in UNREAD for path in sorted(source.glob(pattern))]
+    if others:
+        order = ", ".join(kinds[1:])
+        lines.append(f"{source}: read as {reader.name}; not read: {', '.join(others)} (order of preference: {order})")
+    if reader.name == kinds[4]:
+        above = source.absolute().parent
+        beside = [above / "sparse"] if models_below(above / "sparse") else []
+        beside += [path for path in json_files(above) if path.name.startswith("transforms")]
+        lines += [f"{path} holds poses that are not read; give {above} to use them" for path in beside]
+    return lines

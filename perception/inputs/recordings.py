@@ -11,12 +11,13 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.geometry import inverse_se3
+from perception.inputs.far import without_far
 from perception.io.documents import safe_name
 from perception.photos.decode import read_picture
 from perception.photos.depth import read_depth
 from perception.photos.ignore_masks import mask_of
 from perception.photos.video import Chooser
-from perception.photos.views import fit_lens, make_view, rigid_pose
+from perception.photos.views import first_of, posed_view, rigid_pose
 from perception.progress import Progress
 from perception.sfm.options import NO_CLOUD, ReadOptions
 from perception.sfm.triangulate import posed_scene
@@ -57,27 +58,46 @@ class Recording:
 
 def recorded_scene(recording: Recording, options: ReadOptions) -> Scene:
     """The chosen frames of a recording as a Scene in its own world, whose unit is the metre.
-    InputError for poses that are not rigid, a missing lens, and depth whose unit cannot be right."""
+    Frames with a pose that is not rigid or far from all others are left out. InputError for a missing lens, and depth
+    whose unit cannot be right."""
     source, kind, lens = recording.source, recording.kind, options.lens or recording.lens
     if not recording.frames:
         raise InputError(f"{source}: a recording as of {kind}, but no frame has both photo and pose")
     if lens is None:
         raise InputError(f"{source}: a recording as of {kind} without the intrinsics of its photos; give --camera FILE")
-    for frame in recording.frames:
-        rigid_pose(frame.world_from_camera, f"{source}: the pose of {frame.name}")
+    recording, wrong = _with_poses(recording, options.strict)
     chosen, damaged = choose_frames(recording, lens, options.progress, options.strict)
     views = [_view(recording, frame, lens, options.masks) for frame in chosen]
+    cloud = options.cloud or NO_CLOUD
+    views, far = without_far(views, cloud[0], set(), options.strict, source)
+    unread = [{"name": name, "why": "the photo cannot be read"} for name in damaged]
     taken = f"{len(chosen)} of {len(recording.frames)} frames chosen, sharp and well spaced"
     facts: dict[str, Any] = {
         "input": kind,
-        "left_out": [{"name": name, "why": "the photo cannot be read"} for name in damaged],
+        "left_out": [*wrong, *unread, *far],
         "notes": [f"{source}: {kind}, {taken}", *recording.notes],
         "warnings": recording.warnings,
         "mean_reprojection_error_px": None,
         "scale": {"source": f"poses and depth of {kind}, in metres by definition"},
     }
     views.sort(key=lambda view: view.name)
-    return replace(posed_scene(views, options.cloud or NO_CLOUD, facts, options, least=1), metric=True)
+    return replace(posed_scene(views, cloud, facts, options, least=1), metric=True)
+
+
+def _with_poses(recording: Recording, strict: bool) -> tuple[Recording, list[dict[str, str]]]:
+    """The recording without the frames whose pose is not rigid, and these as left out; InputError if none is left."""
+    good, wrong = list[Frame](), list[dict[str, str]]()
+    for frame in recording.frames:
+        try:
+            rigid_pose(frame.world_from_camera, f"{recording.source}: the pose of {frame.name}")
+            good.append(frame)
+        except InputError as error:
+            if strict:
+                raise
+            wrong.append({"name": frame.name, "why": str(error)})
+    if not good:
+        raise InputError(f"{recording.source}: none of the {len(wrong)} photos has a usable pose{first_of(wrong)}")
+    return replace(recording, frames=good), wrong
 
 
 def choose_frames(recording: Recording, lens: Lens, progress: Progress, strict: bool) -> tuple[list[Frame], list[str]]:
@@ -127,8 +147,7 @@ def median_depth(recording: Recording) -> float:
 
 
 def _view(recording: Recording, frame: Frame, lens: Lens, masks: Path | None) -> View:
-    fitted, _ = fit_lens(lens, frame.photo, recording.source)
     name = safe_name(frame.name, recording.source)
-    view = make_view(name, frame.photo, fitted, inverse_se3(frame.world_from_camera), recording.source)
+    view, _ = posed_view(name, frame.photo, lens, inverse_se3(frame.world_from_camera), recording.source)
     depth = None if frame.depth is None else DepthImage(frame.depth, 1 / recording.metre, recording.depth_lens)
     return replace(view, depth=depth, mask=mask_of(masks, name))

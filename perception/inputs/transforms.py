@@ -1,11 +1,12 @@
-"""Reads transforms.json of nerfstudio and instant-ngp: camera-to-world matrices with OpenGL camera axes."""
+"""Reads JSON files of nerfstudio, instant-ngp and Blender: camera-to-world matrices with OpenGL camera axes."""
 
 from __future__ import annotations
 
 import contextlib
 import math
 import os
-from dataclasses import replace
+import re
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,15 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
+from perception.inputs.far import without_far
 from perception.inputs.start_cloud import start_points
 from perception.io.documents import brief, read_json, safe_name
 from perception.photos.decode import SUFFIXES, photo_size, why_left_out
 from perception.photos.ignore_masks import mask_of
 from perception.photos.lens import FISHEYE, PERSPECTIVE, opencv_lens
+from perception.photos.named_files import NamedFiles
 from perception.photos.view_json import absolute
-from perception.photos.views import fit_lens, make_view, rigid_pose
+from perception.photos.views import first_of, posed_view, rigid_pose
 from perception.sfm.options import NO_CLOUD, ReadOptions
 from perception.sfm.triangulate import posed_scene
 from perception.types import DepthImage, Lens, Scene, View
@@ -28,90 +31,181 @@ _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV", "PERSPECTIVE")
 MILLIMETRE = 1e-3
 """Unit of depth images without `depth_unit_scale_factor` or `integer_depth_scale`, in metres: nerfstudio's default."""
+_TRAIN, _PART = "transforms_train.json", re.compile(r"transforms_(train|test|val\w*|eval)\.json$")
+_FRAMES = re.compile(rb'"frames"\s*:\s*\[')
+_NEEDED, _LACKS = {"file_path", "transform_matrix"}, "lacks file_path or transform_matrix"
 GRAVITY_ERROR = 1.0
 """Standard error in degrees of a `gravity` without `gravity_std_deg`, as of a phone's motion sensors."""
 
 
-def read_transforms(file: Path, options: ReadOptions) -> Scene:
-    """The frames of a transforms.json whose photos exist, as a Scene in the file's own world.
+def read_transforms(source: Path, options: ReadOptions) -> Scene:
+    """The frames of the JSON files of `transforms_files` whose photos exist, as a Scene in the world of these files.
 
     Intrinsics of a frame override global ones. Without fl_x the focal length is computed from camera_angle_x; without w
     and h the size is that of the photo. Points are read from `ply_file_path`, else triangulated with the given poses.
-    The unit is the metre if `metric` is true. View names are paths below the common folder of all photos. Missing and
-    damaged photos are left out and reported.
+    The unit is the metre if `metric` is true. View names are paths below the common folder of all photos. Photos that
+    are missing or damaged, and frames that are wrong, are left out and reported. Views of frames of a "test" or "val"
+    part are `held_out`.
     """
-    data = _load(file)
-    frames = data["frames"]
+    files = transforms_files(source)
+    file, listing = files[0], _Listing(files[0].parent)
+    data, frames = _load(file), [frame for each in files for frame in _frames(each, each != file)]
     if not frames:
         raise InputError(f"{file}: 'frames' is empty; expected at least one posed photo")
-    photos, missing = _photos(file, frames, options.strict)
-    if not photos:
-        first = f"{missing[0]['name']}: {missing[0]['why']}"
-        raise InputError(f"{file}: none of the {len(frames)} photos it lists can be read (first: {first})")
-    views, notes = _views(file, data, photos, options.masks)
+    views, missing, notes = _views(file, frames, listing, options)
+    if not views:
+        raise InputError(f"{file}: none of the {len(frames)} photos it lists can be used{first_of(missing)}")
     listed = options.cloud
     if listed is None and data.get("ply_file_path"):
-        listed = start_points(_listed(file, "ply_file_path", data["ply_file_path"]))
-    facts: dict[str, Any] = {"input": "transforms", "left_out": missing, "warnings": notes, **_gravity(file, data)}
+        listed = start_points(listing.needed(file, "ply_file_path", data["ply_file_path"]))
+    views, far = without_far(views, (listed or NO_CLOUD)[0], set(), options.strict, file)
+    facts: dict[str, Any] = {
+        "input": "transforms",
+        "left_out": [*missing, *far],
+        "warnings": notes,
+        **_gravity(file, data),
+    }
     facts["mean_reprojection_error_px"] = None
     if options.cloud is None and listed is not None:
         facts["points_from"] = str(data["ply_file_path"])
+    held = sum(view.held_out for view in views)
+    split = f"; {held} of {len(views)} photos are of its test and val parts" if held else ""
+    facts["notes"] = [f"poses of {file.parent}: {', '.join(each.name for each in files)}{split}"]
     scene = posed_scene(views, listed or NO_CLOUD, facts, options, least=1)
     return replace(scene, metric=data.get("metric") is True)
 
 
-def transforms_file(source: Path) -> Path:
-    """The transforms.json in a folder, or `source` itself."""
-    return source / "transforms.json" if source.is_dir() else source
+def transforms_files(source: Path) -> list[Path]:
+    """The JSON files that are read of a folder: the first in the order of `json_files`; of `transforms_train.json` also
+    the other parts beside it, "test" and "val". `source` itself for a file; [] without any."""
+    if not source.is_dir():
+        return [source] if source.suffix.lower() == ".json" and source.is_file() else []
+    found = json_files(source)
+    if not found or found[0].name != _TRAIN:
+        return found[:1]
+    return [path for path in found if _PART.match(path.name) and path.parent == found[0].parent]
 
 
-def is_transforms(source: Path) -> bool:
-    """Whether `source` is a JSON file, or a folder with a transforms.json."""
-    return transforms_file(source).suffix.lower() == ".json" and transforms_file(source).is_file()
+def json_files(folder: Path) -> list[Path]:
+    """JSON files with frames in a folder or its `images`, in order of preference: `transforms.json`,
+    `transforms_train.json`, its other parts, any other by name."""
+    ranks = ("transforms.json", _TRAIN)
+    found = [path for path in _listing_frames(folder) if path.name == ranks[0] or _fault(path) is None]
+    return sorted(
+        found, key=lambda path: (ranks.index(path.name) if path.name in ranks else 2, not _PART.match(path.name))
+    )
+
+
+def faults(folder: Path) -> list[str]:
+    """Why JSON files that list frames are not among `json_files`, a line each."""
+    return [fault for path in _listing_frames(folder) if (fault := _fault(path)) is not None]
+
+
+def _listing_frames(folder: Path) -> list[Path]:
+    found = (path for inside in (folder, folder / "images") for path in sorted(inside.glob("*.json")))
+    readable = (path for path in found if os.access(path, os.R_OK))
+    return [path for path in readable if path.name == "transforms.json" or _FRAMES.search(path.read_bytes())]
+
+
+def _fault(file: Path) -> str | None:
+    try:
+        return None if _load(file)["frames"] else f"{file}: 'frames' is empty"
+    except InputError as error:
+        return str(error)
 
 
 def read_frames(file: Path) -> list[tuple[str, np.ndarray, Lens]]:
     """(file_path, camera_from_world [4, 4], lens) of every frame, in file order; with w, h photos need not exist."""
-    data = _load(file)
-    return [(str(f["file_path"]), _pose(file, f), _lens(file, {**data, **f}, None)) for f in data["frames"]]
+    frames = [frame.values for frame in _frames(file)]
+    for index, values in enumerate(frames):
+        if not values.keys() >= _NEEDED:
+            raise InputError(f"{file}: frame {index} {_LACKS}")
+    return [(str(values["file_path"]), _pose(file, values), _lens(file, values, None)) for values in frames]
 
 
-def listed_photos(file: Path) -> tuple[list[Path], bool]:
+def listed_photos(source: Path) -> tuple[list[Path], bool]:
     """The photos that a transforms.json lists and that exist, in file order, and whether it lists depth images."""
-    frames = _load(file)["frames"]
-    found = (_find(file.parent, str(frame["file_path"])) for frame in frames)
-    return [photo for photo in found if photo is not None], any("depth_file_path" in frame for frame in frames)
+    files = transforms_files(source)
+    frames, listing = [frame.values for file in files for frame in _frames(file)], _Listing(files[0].parent)
+    found = (listing.find(str(values.get("file_path"))) for values in frames)
+    return [photo for photo in found if photo is not None], any("depth_file_path" in values for values in frames)
 
 
-def listed_files(file: Path) -> list[Path]:
-    """A transforms.json, and the photos, masks, depth images and cloud that it lists and that exist."""
-    data, keys = _load(file), ("file_path", "mask_path", "depth_file_path", "depth_path")
-    listed = [data.get("ply_file_path"), *(frame.get(key) for frame in data["frames"] for key in keys)]
-    found = (_find(file.parent, str(name)) for name in listed if name)
-    return [file, *(path for path in found if path is not None)]
+def listed_files(source: Path) -> list[Path]:
+    """The files of `transforms_files`, and the photos, masks, depth images and cloud that they list and that exist."""
+    files, keys = transforms_files(source), ("file_path", "mask_path", "depth_file_path", "depth_path")
+    listing, clouds = _Listing(files[0].parent), [_load(file).get("ply_file_path") for file in files]
+    listed = [*clouds, *(frame.values.get(key) for file in files for frame in _frames(file) for key in keys)]
+    found = (listing.find(str(name)) for name in listed if name)
+    return [*files, *(path for path in found if path is not None)]
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A frame of a file. values: its keys, and the global ones that it does not override."""
+
+    file: Path
+    values: dict[str, Any]
+    held_out: bool
+
+
+class _Listing:
+    """The files that a JSON file in `folder` lists: below the folder, or for one inside `images` beside that."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folders = [NamedFiles(folder), *([NamedFiles(folder.parent)] if folder.name == "images" else [])]
+
+    def find(self, listed: str) -> Path | None:
+        """The file; a photo may be listed without its suffix."""
+        found = (folder.find(listed, sorted(SUFFIXES)) for folder in self.folders)
+        return next((path for path in found if path is not None), None)
+
+    def needed(self, file: Path, what: str, listed: object) -> Path:
+        """`find`, or an InputError that says what `file` lists."""
+        path = self.find(str(listed))
+        if path is None:
+            raise InputError(f"{file}: {what} {brief(listed)} does not exist; remove the entry or add the file")
+        return path
 
 
 def _views(
-    file: Path, data: dict[str, Any], photos: dict[int, Path], masks: Path | None
-) -> tuple[list[View], list[str]]:
-    """Views sorted by name, and notes. photos: by number of the frame."""
-    views, notes = dict[str, View](), set[str]()
-    root = os.path.commonpath([absolute(photo).parent for photo in photos.values()])
+    file: Path, frames: list[_Frame], listing: _Listing, options: ReadOptions
+) -> tuple[list[View], list[dict[str, str]], list[str]]:
+    """Views sorted by name, what is left out, and notes."""
+    views, missing, notes, photos = dict[str, View](), list[dict[str, str]](), set[str](), dict[int, Path]()
+    for index, values in enumerate(frame.values for frame in frames):
+        photo = listing.find(str(values.get("file_path")))
+        why = "listed, but the photo is missing" if photo is None else why_left_out(photo, options.strict)
+        if not values.keys() >= _NEEDED:
+            why = f"{file}: frame {index} {_LACKS}"
+            if options.strict:
+                raise InputError(why)
+        if photo is None or why is not None:
+            missing.append({"name": str(values.get("file_path", f"frame {index}")), "why": str(why)})
+        else:
+            photos[index] = photo
+    root = os.path.commonpath([absolute(photo).parent for photo in photos.values()]) if photos else ""
     for index, photo in photos.items():
-        frame = data["frames"][index]
-        lens, note = fit_lens(_lens(file, {**data, **frame}, photo), photo, file)
-        name = safe_name(absolute(photo).relative_to(root).as_posix(), file)
+        frame, name = frames[index], safe_name(absolute(photo).relative_to(root).as_posix(), file)
+        values = frame.values
         if name in views:
             notes.add(f"{name} is listed more than once; the first pose is used")
             continue
-        view = make_view(name, photo, lens, _pose(file, frame), file)
-        mask = mask_of(masks, name)
-        if mask is None and frame.get("mask_path"):
-            mask = _listed(file, "mask", frame["mask_path"])
-        views[name] = replace(view, depth=_depth(file, data, frame), mask=mask)
+        try:
+            lens, pose = _lens(frame.file, values, photo), _pose(frame.file, values)
+            view, note = posed_view(name, photo, lens, pose, frame.file)
+        except InputError as error:
+            if options.strict:
+                raise
+            missing.append({"name": name, "why": str(error)})
+            continue
+        mask = mask_of(options.masks, name)
+        if mask is None and values.get("mask_path"):
+            mask = listing.needed(frame.file, "mask", values["mask_path"])
+        views[name] = replace(view, depth=_depth(frame.file, values, listing), mask=mask, held_out=frame.held_out)
         if note:
             notes.add(note)
-    return [views[name] for name in sorted(views)], sorted(notes)
+    return [views[name] for name in sorted(views)], missing, sorted(notes)
 
 
 def _load(file: Path) -> dict[str, Any]:
@@ -119,29 +213,22 @@ def _load(file: Path) -> dict[str, Any]:
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list):
         raise InputError(f"{file}: expected an object with a list 'frames' (nerfstudio / instant-ngp)")
-    for index, frame in enumerate(frames):
-        if not isinstance(frame, dict) or not {"file_path", "transform_matrix"} <= frame.keys():
-            raise InputError(f"{file}: frame {index} lacks file_path or transform_matrix")
+    if frames and not any(isinstance(frame, dict) and frame.keys() >= _NEEDED for frame in frames):
+        raise InputError(f"{file}: frame 0 {_LACKS}")
     return data
 
 
-def _photos(file: Path, frames: list[dict[str, Any]], strict: bool) -> tuple[dict[int, Path], list[dict[str, str]]]:
-    photos, missing = {}, []
-    for index, frame in enumerate(frames):
-        photo = _find(file.parent, str(frame["file_path"]))
-        why = "listed, but the photo is missing" if photo is None else why_left_out(photo, strict)
-        if photo is not None and why is None:
-            photos[index] = photo
-        else:
-            missing.append({"name": str(frame["file_path"]), "why": str(why)})
-    return photos, missing
-
-
-def _find(folder: Path, listed: str) -> Path | None:
-    plain = folder / listed
-    others = (plain.with_name(plain.name + suffix) for suffix in sorted(SUFFIXES) if plain.name)
-    # Path.is_file raises for a name that is too long for the file system.
-    return next((path for path in (plain, *others) if os.path.isfile(path)), None)  # noqa: PTH113
+def _frames(file: Path, held_out: bool = False) -> list[_Frame]:
+    """The frames of a file. held_out: the file is another part than "train"; else the lists of nerfstudio say."""
+    data = _load(file)
+    shared = {key: value for key, value in data.items() if key != "frames"}
+    listed = (data.get(f"{key}_filenames") for key in ("train", "val", "test"))
+    train, val, test = ({str(name) for name in names} if isinstance(names, list) else set() for names in listed)
+    own = [frame if isinstance(frame, dict) else {} for frame in data["frames"]]
+    return [
+        _Frame(file, {**shared, **values}, held_out or str(values.get("file_path")) in (val | test) - train)
+        for values in own
+    ]
 
 
 def _pose(file: Path, frame: dict[str, Any]) -> np.ndarray:
@@ -155,24 +242,17 @@ def _pose(file: Path, frame: dict[str, Any]) -> np.ndarray:
     return OPENCV_FROM_OPENGL @ inverse_se3(rigid_pose(matrix, what))
 
 
-def _depth(file: Path, data: dict[str, Any], frame: dict[str, Any]) -> DepthImage | None:
+def _depth(file: Path, frame: dict[str, Any], listing: _Listing) -> DepthImage | None:
     """The depth image that a frame names; the unit is a millimetre unless a scale is given, as in nerfstudio."""
     listed = frame.get("depth_file_path", frame.get("depth_path"))
     if not listed:
         return None
     what, keys = f"{file}: {frame['file_path']}", ("depth_unit_scale_factor", "integer_depth_scale")
-    scales = (_number({**data, **frame}, key, what) for key in keys)
+    scales = (_number(frame, key, what) for key in keys)
     scale = next((scale for scale in scales if scale is not None), MILLIMETRE)
     if scale <= 0:
         raise InputError(f"{what}: the scale of its depth must be above 0, found {scale:g}")
-    return DepthImage(_listed(file, "depth image", listed), scale)
-
-
-def _listed(file: Path, what: str, listed: object) -> Path:
-    path = _find(file.parent, str(listed))
-    if path is None:
-        raise InputError(f"{file}: {what} {brief(listed)} does not exist; remove the entry or add the file")
-    return path
+    return DepthImage(listing.needed(file, "depth image", listed), scale)
 
 
 def _gravity(file: Path, data: dict[str, Any]) -> dict[str, Any]:
@@ -198,7 +278,7 @@ def _lens(file: Path, values: dict[str, Any], photo: Path | None) -> Lens:
     if width is None or height is None:
         if photo is None:
             raise InputError(f"{what} has no w and h")
-        width, height = photo_size(photo)
+        width, height = photo_size(photo, as_stored=True)
     fx, fy = _focals(values, what, width, height)
     cx, cy = _number(values, "cx", what), _number(values, "cy", what)
     center = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)

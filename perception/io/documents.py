@@ -4,6 +4,7 @@ are an InputError with a one-line message.
 
 from __future__ import annotations
 
+import codecs
 import json
 import re
 import struct
@@ -36,10 +37,16 @@ DAMAGE = (
 """Exceptions that numpy, zipfile, PyYAML and Pillow raise on bytes that are not what they read, or a part of it."""
 
 
+def text_of(data: bytes, errors: str = "strict") -> str:
+    """Text in UTF-8, with or without a byte-order mark, or in UTF-16 with one. errors: as of bytes.decode."""
+    sixteen = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return data.decode("utf-16" if sixteen else "utf-8-sig", errors)
+
+
 def read_json(file: Path) -> Any:
     """The value in a JSON file; InputError when it is not valid JSON."""
     try:
-        return json.loads(file.read_text(encoding="utf-8"))
+        return json.loads(text_of(file.read_bytes()))
     except FileNotFoundError as error:
         raise InputError(f"{file}: no such file") from error
     except (OSError, ValueError, RecursionError) as error:
@@ -58,7 +65,7 @@ def read_yaml(file: Path, expected: str) -> Any:
             return super().compose_node(parent, index)
 
     with refusing(f"{file}: not readable YAML ({{why}}); expected {expected}"):
-        return yaml.load(file.read_text(encoding="utf-8"), Loader)
+        return yaml.load(text_of(file.read_bytes()), Loader)
 
 
 @contextmanager

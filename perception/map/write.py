@@ -28,6 +28,7 @@ from perception.map.checksums import EDITABLE, FACTS, REPORT, facts_of, listed_f
 from perception.map.files import FORMAT_VERSION, MapFiles
 from perception.map.map import Map
 from perception.map.replace import map_directory, writing
+from perception.photos.named_files import NamedFiles, folded
 from perception.photos.view_json import StoredView, moved_record, stored_view, view_from_json, view_json
 from perception.types import View
 
@@ -129,7 +130,8 @@ def tidy_label(label: str) -> str:
 def relink(path: Path, folder: Path) -> dict[str, Any]:
     """Records for every view of the map at `path` the photo below `folder` with the same name and size.
 
-    A photo is searched by the view name ("a/0001.jpg"), else by the file name alone if that is unique below `folder`.
+    A photo is searched by the view name ("a/0001.jpg"), else by the file name alone if that is unique below `folder`;
+    capitals and small letters are the same.
     Views without such a photo keep their record. Returns {"linked": count, "missing": names, "differ": names of
     photos of another size}. InputError when no photo is found, or while the map is locked by another writer.
     """
@@ -137,13 +139,14 @@ def relink(path: Path, folder: Path) -> dict[str, Any]:
         raise InputError(f"{folder}: is no folder; give the one that holds the photos of {path}")
     by_name: dict[str, list[Path]] = defaultdict(list)
     for file in sorted(folder.rglob("*")):
-        by_name[file.name].append(file)
+        by_name[folded(file.name)].append(file)
+    named = NamedFiles(folder)
     with writing(path):
         files = MapFiles(path)
         entries, linked, missing, differ = [], 0, [], []
         for entry, view in zip(files.facts.get("views", []), files.read("views"), strict=True):
-            alike = by_name[PurePosixPath(view.name).name]
-            found = next((f for f in (folder / view.name, *(alike if len(alike) == 1 else [])) if f.is_file()), None)
+            alike = by_name[folded(PurePosixPath(view.name).name)]
+            found = named.find(view.name) or (alike[0] if len(alike) == 1 and alike[0].is_file() else None)
             if found is None:
                 missing.append(view.name)
             elif view.photo_bytes not in (None, found.stat().st_size):

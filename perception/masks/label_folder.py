@@ -11,6 +11,7 @@ from perception.errors import InputError
 from perception.io.documents import safe_name
 from perception.masks.base import MaskSource
 from perception.masks.label_files import read_labels, read_png_header
+from perception.photos.named_files import NamedFiles
 from perception.types import View
 
 _COLOUR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGB with alpha"}
@@ -31,6 +32,7 @@ class LabelFolder(MaskSource):
             digest.update(f"{file.relative_to(folder)} {status.st_size} {status.st_mtime_ns}\n".encode())
         self.name, self.folder, self.identity = "labels", folder, f"labels {digest.hexdigest()[:16]}"
         self._files: dict[str, Path] = {}
+        self._named = NamedFiles(folder)
 
     def check(self, views: list[View]) -> list[str]:
         """Checks that every view has a label image of its photo's size. Label images without a view give a warning."""
@@ -64,11 +66,8 @@ class LabelFolder(MaskSource):
 
     def _find(self, view: View, views: list[View]) -> Path | None:
         stem = PurePosixPath(safe_name(view.name, f"labels:{self.folder}")).with_suffix(".png")
-        if (self.folder / stem).is_file():
-            return self.folder / stem
-        flat = self.folder / stem.name
         sharing = sum(PurePosixPath(other.name).stem == stem.stem for other in views)
-        return flat if sharing == 1 and flat.is_file() else None
+        return self._named.find(str(stem)) or (self._named.find(stem.name) if sharing == 1 else None)
 
 
 def _check_header(file: Path, width: int, height: int) -> None:

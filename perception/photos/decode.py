@@ -21,7 +21,9 @@ from perception.photos.lens import warp_grid
 from perception.types import Lens, View
 
 HEIF_SUFFIXES = frozenset({".heic", ".heif", ".hif"})
-SUFFIXES = HEIF_SUFFIXES | {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
+_HEIF_BRANDS, _OTHERS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1"), (b"\xff\xd8", b"\x89PNG")
+"""Bytes 8 to 12 of HEIC, and how JPEG and PNG begin: phones and chats give files each other's endings."""
+SUFFIXES = HEIF_SUFFIXES | {".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".tif", ".tiff", ".bmp", ".webp", ".avif"}
 LARGE_PIXELS = 200_000_000
 """Photos of more pixels are read at 1/2, 1/4 or 1/8 of their size; `photo_size` returns the reduced size."""
 MOST_DECODED = 400_000_000
@@ -37,19 +39,23 @@ cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 warnings.filterwarnings("ignore", category=UserWarning, module="PIL")
 
 
-def photo_size(path: Path) -> tuple[int, int]:
-    """(width, height) of what read_photo returns, from the header: EXIF rotation applied, large photos reduced."""
+def photo_size(path: Path, as_stored: bool = False) -> tuple[int, int]:
+    """(width, height) of what read_photo returns, from the header: large photos reduced."""
     with open_photo(path) as image:
-        tags = getattr(image, "tag_v2", {})  # depending on its version, Pillow has rotated the size of a TIFF
-        size = reduced_size(int(tags.get(0x0100, image.width)), int(tags.get(0x0101, image.height)), _reduction(image))
+        size = reduced_size(*_stored_size(image), _reduction(image))
         turned = exif_of(image, path).get(ORIENTATION) in (5, 6, 7, 8)  # other values do not swap the sides
-        return size[::-1] if turned else size
+        return size[::-1] if turned and not as_stored else size
 
 
-def stored_size(path: Path) -> tuple[int, int]:
-    """(width, height) in the file's header: without EXIF rotation, not reduced."""
+def is_turned(path: Path) -> bool:
+    """Whether EXIF says that the photo is to be rotated or mirrored."""
     with open_photo(path) as image:
-        return image.size
+        return exif_of(image, path).get(ORIENTATION) in _BACK
+
+
+def _stored_size(image: Image.Image) -> tuple[int, int]:
+    tags = getattr(image, "tag_v2", {})  # depending on its version, Pillow has rotated the size of a TIFF
+    return int(tags.get(0x0100, image.width)), int(tags.get(0x0101, image.height))
 
 
 def reduced_size(width: int, height: int, factor: int) -> tuple[int, int]:
@@ -95,8 +101,8 @@ def why_left_out(path: Path, strict: bool = False) -> str | None:
     return None
 
 
-def read_photo(path: Path) -> np.ndarray:
-    """The photo as uint8 [h, w, 3] RGB, rotated as in EXIF; (w, h) = photo_size(path).
+def read_photo(path: Path, as_stored: bool = False) -> np.ndarray:
+    """The photo as uint8 [h, w, 3] RGB, rotated as in EXIF unless `as_stored`; (w, h) = photo_size(path, as_stored).
     Grey is repeated to three channels, 16 bits become 8 (v / 257 rounded), palettes are expanded; transparent pixels
     are composited on black. Floating-point images are refused. HEIC needs pillow-heif (extra "heic")."""
     with open_photo(path) as image:
@@ -104,14 +110,31 @@ def read_photo(path: Path) -> np.ndarray:
         if factor > 1:
             image.draft(None, (width // factor, height // factor))  # only JPEG is decoded at a reduced size
             factor = max(1, round(factor * image.width / width))
+        back = _BACK.get(getattr(image, "tag_v2", {}).get(ORIENTATION, 1))  # Pillow turns a TIFF when it decodes it
         decode(image, path)
-        photo = to_rgb(upright(image, path), path)
+        if not as_stored:
+            image = upright(image, path)
+        elif back is not None:
+            image = image.transpose(back)
+        photo = to_rgb(image, path)
     return photo if factor == 1 else np.array(Image.fromarray(photo).reduce(factor))
 
 
-def read_grey(path: Path) -> np.ndarray:
+_BACK = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_90,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_270,
+}
+"""What undoes the rotation of an upright picture, by EXIF's orientation."""
+
+
+def read_grey(path: Path, as_stored: bool = False) -> np.ndarray:
     """`read_photo` as uint8 [h, w] grey."""
-    return np.asarray(cv2.cvtColor(read_photo(path), cv2.COLOR_RGB2GRAY))
+    return np.asarray(cv2.cvtColor(read_photo(path, as_stored), cv2.COLOR_RGB2GRAY))
 
 
 def scaled_size(view: View, max_side: int | None) -> tuple[int, int]:
@@ -130,7 +153,7 @@ def scaled_K(view: View, width: int, height: int) -> np.ndarray:
 def load_photo(view: View, max_side: int | None = None) -> np.ndarray:
     """The view's picture as uint8 [h, w, 3] RGB through its ideal pinhole, (w, h) = scaled_size(view, max_side).
     The photo is downscaled by area averaging, then undistorted with bilinear interpolation. Only the last warps are
-    cached. A photo is used without EXIF rotation if only then its size fits the camera (COLMAP ignores EXIF)."""
+    cached."""
     width, height = scaled_size(view, max_side)
     photo = _oriented(view)
     if view.lens is None:
@@ -181,13 +204,11 @@ def _grid(view: View, lens: Lens, width: int, height: int) -> tuple[np.ndarray, 
 
 def _oriented(view: View) -> np.ndarray:
     width, height = view.photo_size
-    photo = read_photo(view.photo)
+    photo = read_photo(view.photo, view.as_stored)
+    if photo.shape[:2] != (height, width) and photo_size(view.photo, as_stored=True) == view.photo_size:
+        photo = read_photo(view.photo, as_stored=True)  # maps of version 1.0 do not have `as_stored`
     if photo.shape[:2] == (height, width):
         return photo
-    if stored_size(view.photo) == view.photo_size:
-        with open_photo(view.photo) as image:
-            decode(image, view.photo)
-            return to_rgb(image, view.photo)
     found = "×".join(map(str, photo.shape[1::-1]))
     raise InputError(f"{view.photo}: the photo is {found}, its camera expects {width}×{height}")
 
@@ -205,12 +226,6 @@ _HEADER = 1 << 16
 
 def open_photo(path: Path) -> Image.Image:
     """The picture opened by Pillow, not decoded. InputError if it is missing or Pillow cannot read it."""
-    if path.suffix.lower() in HEIF_SUFFIXES:
-        try:
-            import pillow_heif
-        except ImportError as error:
-            raise missing_extra("pillow-heif", "heic") from error
-        pillow_heif.register_heif_opener(thumbnails=False)
     with refusing(f"{path}: not a readable image; replace or remove it"):
         try:
             regular = S_ISREG(path.stat().st_mode)
@@ -219,11 +234,21 @@ def open_photo(path: Path) -> Image.Image:
         if not regular:
             raise ValueError("no file")  # to open a FIFO would mean to wait for its writer
         with path.open("rb") as file:
-            file.read(_HEADER)  # on a disk that hangs, this waits, without the lock that other photos need
+            header = file.read(_HEADER)  # on a disk that hangs, this waits, without the lock that other photos need
+        if header[8:12] in _HEIF_BRANDS or (path.suffix.lower() in HEIF_SUFFIXES and not header.startswith(_OTHERS)):
+            _register_heif()
         image = _open(path)
         most = math.inf if image.format in _REDUCED else None  # that of these is checked when it is known
         check_size(path, image.size, image.format, path.stat().st_size, most)
         return image
+
+
+def _register_heif() -> None:
+    try:
+        import pillow_heif
+    except ImportError as error:
+        raise missing_extra("pillow-heif", "heic") from error
+    pillow_heif.register_heif_opener(thumbnails=False)
 
 
 def _open(source: Path | io.BytesIO) -> Image.Image:

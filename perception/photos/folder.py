@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -14,6 +14,7 @@ from PIL import Image
 from perception.errors import InputError
 from perception.machine import cores
 from perception.photos.decode import SUFFIXES, decode, open_photo, photo_size, upright
+from perception.photos.lens import resized
 from perception.photos.video import FRAMES_RECORD, THUMBNAIL, motion_between
 from perception.progress import Progress
 
@@ -21,6 +22,9 @@ VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
 SAME_MOTION, SAME_GREY = 0.006, 6.0
 """Neighbouring photos are duplicates when their corners move by less than this share of the width and their 320 pixel
 thumbnails differ by less than this mean grey level. Measured between neighbours on a walk: at least 0.011 and 11."""
+COPY_BLUR = 2.0
+"""Standard deviation in pixels of the thumbnail by which photos of other sizes are blurred before they are compared:
+copies of photos of leaves then differ by 1 grey level."""
 PANORAMA_ASPECT, PANORAMA_EXCESS = 2.2, 1.5
 """Least aspect ratio (long / short side) of a panorama: absolute, and as a multiple of the folder's median."""
 BLURRED = 0.1
@@ -80,6 +84,20 @@ def list_photos(folder: Path, suffixes: frozenset[str] = SUFFIXES) -> list[Path]
     return [folder / path for path in sorted(found)]
 
 
+def folders_below(folder: Path, depth: int) -> list[Path]:
+    """`folder` and those down to `depth` below it, sorted, without hidden ones, maps and work folders."""
+    found = [folder]
+    if depth > 0:
+        try:
+            inside = sorted(entry.name for entry in os.scandir(folder) if entry.is_dir())
+        except OSError:  # a folder without read permission
+            inside = []
+        for name in inside:
+            if not name.startswith(".") and ".gsmap" not in name:
+                found += folders_below(folder / name, depth - 1)
+    return found
+
+
 def view_name(photo: Path, folder: Path) -> str:
     """The photo's path below `folder`, as `safe_name` accepts it.
 
@@ -96,7 +114,8 @@ def choose_photos(folder: Path, strict: bool, progress: Progress) -> PhotoSet:
     """The photos under `folder` to use for structure from motion; each photo is read once, in several threads.
 
     Left out with the reason: damaged photos, panoramas (not pinhole images) and duplicates. Of neighbours by name with
-    nearly the same picture (bursts, JPEG and HEIC of one photo) the sharpest is kept, of equal pictures the first.
+    nearly the same picture (bursts, JPEG and HEIC of one photo) the sharpest is kept, of equal pictures the first, of
+    copies at other sizes the largest.
     Blurred photos are kept and reported. strict: the first photo that cannot be read is raised as InputError.
     """
     paths = list_photos(folder)
@@ -151,7 +170,10 @@ def _leave_out_panoramas(looks: list[_Look]) -> None:
 
 
 def _leave_out_doubles(looks: list[_Look]) -> None:
-    """Marks all but the sharpest of similar neighbours, then all but the first of equal pictures, as left out."""
+    """Marks copies at other sizes, then all but the sharpest of similar neighbours, then all but the first of equal
+    pictures, as left out."""
+    _leave_out_copies(looks)
+    looks = [look for look in looks if look.why is None]
     runs: list[list[_Look]] = []
     for look in looks:
         if runs and _same_picture(runs[-1][0], look):
@@ -167,6 +189,28 @@ def _leave_out_doubles(looks: list[_Look]) -> None:
         first = pictures.setdefault((best.size, best.grey.tobytes()), best)
         if first is not best:
             best.why = f"a double: the same picture as {first.name}"
+
+
+def _leave_out_copies(looks: list[_Look]) -> None:
+    """Marks photos that show the same as a larger one of the same name elsewhere, such as `images_4/1.jpg` beside
+    `images/1.jpg`. Photos of equal size stay: they may be of two cameras."""
+    alike: dict[str, list[_Look]] = {}
+    for look in sorted(looks, key=lambda look: -look.size[0] * look.size[1]):
+        larger = alike.setdefault(Path(look.name).stem.casefold(), [])
+        copied = next((other for other in larger if other.size != look.size and _is_copy(look, other)), None)
+        if copied is None:
+            larger.append(look)
+        else:
+            look.why = f"a double: the same picture as {copied.name} at another size"
+
+
+def _is_copy(small: _Look, large: _Look) -> bool:
+    if not resized(small.size, large.size):
+        return False
+    grey = cv2.resize(large.grey, small.grey.shape[::-1], interpolation=cv2.INTER_AREA)
+    # Programs that resize differ in sharpness, which blurring evens out.
+    blurred = (cv2.GaussianBlur(picture, (0, 0), COPY_BLUR) for picture in (small.grey, grey))
+    return _same_picture(*(replace(small, grey=picture) for picture in blurred))
 
 
 def _same_picture(a: _Look, b: _Look) -> bool:

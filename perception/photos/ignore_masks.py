@@ -5,6 +5,7 @@ As in COLMAP and nerfstudio. They keep pixels out of features, label images, los
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.photos.decode import nearest, photo_size, read_picture, warp_labels
 from perception.photos.lens import same_aspect
+from perception.photos.named_files import NamedFiles
 from perception.types import Scene, View
 
 
@@ -21,8 +23,9 @@ def mask_of(folder: Path | None, name: str) -> Path | None:
     """The mask of photo `name` in `folder`: "a/1.png" or "a/1.jpg.png" for "a/1.jpg"; None without one."""
     if folder is None:
         return None
-    paths = (folder / Path(name).with_suffix(".png"), folder / f"{name}.png")
-    return next((path for path in paths if path.is_file()), None)
+    names = (str(Path(name).with_suffix(".png")), f"{name}.png")
+    exact = next((folder / name for name in names if (folder / name).is_file()), None)
+    return exact or next(filter(None, map(NamedFiles(folder).find, names)), None)
 
 
 def read_mask(path: Path, width: int, height: int) -> np.ndarray:
@@ -47,11 +50,18 @@ def load_weight(view: View, width: int, height: int) -> np.ndarray | None:
     return (warp_labels(view, read_mask(view.mask, *view.photo_size), width, height) > 0).astype(np.float32)
 
 
-def stage_masks(folder: Path, photos: list[Path], names: list[str], masks: list[Path | None]) -> None:
-    """Writes the masks into the new `folder` as COLMAP names them ("NAME.png"), white for photos without a mask."""
+def stage_masks(
+    folder: Path,
+    photos: list[Path],
+    names: list[str],
+    masks: list[Path | None],
+    as_stored: Sequence[bool] | None = None,
+) -> None:
+    """Writes the masks into the new `folder` as COLMAP names them ("NAME.png"), white for photos without a mask.
+    as_stored: as of `stage_photos`."""
     folder.mkdir()
-    for photo, name, mask in zip(photos, names, masks, strict=True):
-        width, height = photo_size(photo)
+    for photo, name, mask, stored in zip(photos, names, masks, as_stored or [False] * len(photos), strict=True):
+        width, height = photo_size(photo, stored)
         used = np.full((height, width), 255, np.uint8) if mask is None else read_mask(mask, width, height)
         (folder / f"{name}.png").write_bytes(cv2.imencode(".png", used)[1].tobytes())
 

@@ -111,6 +111,17 @@ def same_aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:
     return abs(a[0] * b[1] / (a[1] * b[0]) - 1) <= _ASPECT
 
 
+def resized(a: tuple[int, int], b: tuple[int, int]) -> bool:
+    """Whether a photo of size b (width, height) may be one of size a, resized: by one ratio, to less than a pixel of
+    the smaller one, as programs round up or down."""
+    (small_w, small_h), (large_w, large_h) = sorted((a, b))
+    low, high = (
+        max((small_w - 1) / large_w, (small_h - 1) / large_h),
+        min((small_w + 1) / large_w, (small_h + 1) / large_h),
+    )
+    return low < high and small_h <= large_h
+
+
 def is_pinhole(lens: Lens) -> bool:
     """True when photos of this lens need no undistortion."""
     if lens.model in _PINHOLES:

@@ -2,7 +2,7 @@
 
 name, K, width, height, camera_from_world, lens, held_out: as in `types.View`. photo: absolute path of the photo.
 photo_beside: its path relative to the map's folder. photo_bytes: its size in bytes; a file of another size is not
-accepted. The last two may be null.
+accepted. The last two may be null. as_stored: true where EXIF rotation is not applied.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _GAIN = Annotated[list[Annotated[float, Field(gt=0, lt=1e3)]], Len(3, 3)]
 _VIEW = {
     "name": PhotoName, "photo": PathText, "K": Intrinsics, "width": Side, "height": Side, "camera_from_world": Pose,
     "lens?": _LENS | None, "held_out?": bool, "photo_beside?": PathText | None, "photo_bytes?": Bytes | None,
-    "depth?": _DEPTH | None, "mask?": PathText | None, "gain?": _GAIN | None,
+    "depth?": _DEPTH | None, "mask?": PathText | None, "gain?": _GAIN | None, "as_stored?": bool,
 }  # fmt: skip
 VIEW: Any = Annotated[typed(_VIEW), AfterValidator(_pixels)]
 """A view in map.json."""
@@ -67,7 +67,20 @@ def stored_view(view: View, folder: Path, held_out: bool = False) -> StoredView:
     """`view` with the record of its photo for the map at `folder`: both paths, and the size (None if missing)."""
     photo = absolute(view.photo)  # links are kept: the user names his photos by them
     K, pose = np.asarray(view.K, np.float64), np.asarray(view.camera_from_world, np.float64)
-    own = (view.name, photo, K, view.width, view.height, pose, view.lens, held_out, None, None, view.gain)
+    own = (
+        view.name,
+        photo,
+        K,
+        view.width,
+        view.height,
+        pose,
+        view.lens,
+        held_out,
+        None,
+        None,
+        view.gain,
+        view.as_stored,
+    )
     return StoredView(*own, _relative(photo, folder), _bytes(photo))
 
 
@@ -123,6 +136,10 @@ def view_json(view: View) -> dict[str, Any]:
     }
     if isinstance(view, StoredView):
         entry |= {name: getattr(view, name) for name in ("held_out", "photo_beside", "photo_bytes")}
+    elif view.held_out:
+        entry["held_out"] = True
+    if view.as_stored:
+        entry["as_stored"] = True
     if view.depth is not None:
         entry["depth"] = [str(absolute(view.depth.path)), view.depth.scale, _lens_json(view.depth.lens)]
     if view.gain is not None:
@@ -148,6 +165,7 @@ def view_from_json(entry: dict[str, Any]) -> StoredView:
         None if depth is None else DepthImage(Path(depth[0]), float(depth[1]), _lens_of(depth[2])),
         None if mask is None else Path(mask),
         None if gain is None else (float(gain[0]), float(gain[1]), float(gain[2])),
+        entry.get("as_stored", False),
         beside,
         size,
     )

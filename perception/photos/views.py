@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from perception.errors import InputError
 from perception.geometry import nearest_rotation
-from perception.photos.decode import photo_size, reduced_size, stored_size
-from perception.photos.lens import is_pinhole, pinhole_from_lens, rescale_lens
+from perception.photos.decode import is_turned, photo_size
+from perception.photos.lens import is_pinhole, pinhole_from_lens, rescale_lens, resized
 from perception.types import Lens, View
 
 FARTHEST = 1e12
 """Maximum translation in scene units; float64 resolves about 1e-4 units there."""
+_RESIZED = 0.1
+"""Least relative difference between the areas of a photo and of its camera where one is taken for the other resized: a
+difference of a pixel at about the same size is another camera."""
 
 
 def make_view(name: str, photo: Path, lens: Lens, camera_from_world: np.ndarray, source: Path) -> View:
@@ -38,17 +42,31 @@ def rigid_pose(matrix: np.ndarray, what: str) -> np.ndarray:
     return pose
 
 
-def fit_lens(lens: Lens, photo: Path, source: Path) -> tuple[Lens, str | None]:
-    """The lens scaled to the photo's size, and a note if it was scaled; InputError if the aspect ratio differs.
-    For a large photo that is read at 1/2, 1/4 or 1/8, the lens of the full size is scaled in the same way."""
-    size, full = photo_size(photo), (lens.width, lens.height)
-    if full in (size, stored_size(photo)) and max(full) <= max(size):
-        return lens, None
-    if size[0] * lens.height == size[1] * lens.width or size in (reduced_size(*full, k) for k in (2, 4, 8)):
-        note = f"{photo.name}: photo {size[0]}×{size[1]}, camera {lens.width}×{lens.height}: intrinsics scaled"
-        return rescale_lens(lens, *size), note
-    found = f"{photo.name} is {size[0]}×{size[1]} but its camera says {lens.width}×{lens.height}"
+def posed_view(
+    name: str, photo: Path, lens: Lens, pose: np.ndarray, source: Path, upright: bool = False
+) -> tuple[View, str | None]:
+    """`make_view` of a photo with the lens that its camera says, scaled to the photo's size, and a note if it was.
+
+    Poses of other tools belong to the pixels as they are stored: EXIF rotation is not applied, unless the camera fits
+    only the upright photo. upright: the poses are of the upright photo. InputError if sizes differ in their shape.
+    """
+    for as_stored in (False,) if upright else (True, False):
+        if (fitted := fit_lens(lens, photo, as_stored)) is not None:
+            view = replace(make_view(name, photo, fitted, pose, source), as_stored=as_stored and is_turned(photo))
+            size, full = f"{fitted.width}×{fitted.height}", f"{lens.width}×{lens.height}"
+            return view, None if size == full else f"{photo.name}: photo {size}, camera {full}: intrinsics scaled"
+    found = f"{photo.name} is {'×'.join(map(str, photo_size(photo)))} but its camera says {lens.width}×{lens.height}"
     raise InputError(f"{source}: {found}; give the camera of these photos or the photos of this camera")
+
+
+def fit_lens(lens: Lens, photo: Path, as_stored: bool) -> Lens | None:
+    """The lens scaled to the size at which the photo is read; None for a camera of another shape."""
+    size, full = photo_size(photo, as_stored), (lens.width, lens.height)
+    if size == full:
+        return lens
+    other = abs(size[0] * size[1] / (full[0] * full[1]) - 1) > _RESIZED
+    fits = size[0] * full[1] == size[1] * full[0] or (other and resized(size, full))
+    return rescale_lens(lens, *size) if fits else None
 
 
 def view_lens(view: View) -> Lens:
@@ -57,3 +75,8 @@ def view_lens(view: View) -> Lens:
         return view.lens
     K = view.K
     return Lens("PINHOLE", tuple(map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))), view.width, view.height)
+
+
+def first_of(left_out: list[dict[str, str]]) -> str:
+    """The first photo that was left out and why, for the message of an error; empty where none was."""
+    return f" (first: {left_out[0]['name']}: {left_out[0]['why']})" if left_out else ""

@@ -55,17 +55,19 @@ def build_features(
     options: ReadOptions,
     masks: list[Path | None] | None = None,
     posed: bool = False,
+    as_stored: list[bool] | None = None,
 ) -> FeatureStore:
     """Extracts and matches features, unless the workdir holds the result of the same photos, lenses, seed and options.
 
     lenses: known intrinsics per photo, or None to let structure from motion find them. Photos share one camera when
     size, EXIF camera and known lens agree. masks: of pixels without features, per photo (see `ignore_masks`).
-    posed: the poses are known, so fewer pairs are matched (POSED_PARTNERS).
+    posed: the poses are known, so fewer pairs are matched (POSED_PARTNERS). as_stored: see `stage_photos`.
     """
     seed, progress, local = options.seed, options.progress, options.engine.kind == "local"
     masks = masks if masks and any(masks) else None
+    as_stored = as_stored if as_stored and any(as_stored) else None
     most = POSED_PARTNERS if posed else len(photos)
-    key = _key(photos, lenses, (seed, most), masks)
+    key = _key(photos, lenses, (seed, most, *(as_stored or ())), masks)
     folder = options.workdir / f"features-{key}"
     tasks = FeatureTasks(options.workdir / f"feature-tasks-{key}", options.engine, progress)
     recover(folder)
@@ -73,15 +75,15 @@ def build_features(
         with atomic_directory(folder) as new:
             load_pycolmap().set_random_seed(seed)
             started = time.perf_counter()
-            names = stage_photos(new / "photos", photos, progress)
+            names = stage_photos(new / "photos", photos, progress, as_stored)
             if masks is not None:
-                stage_masks(new / "masks", photos, names, masks)
+                stage_masks(new / "masks", photos, names, masks, as_stored)
             database = new / "database.db"
             groups = features.import_photos(database, new / "photos", photos, names, lenses)
             if local:
                 features.extract(database, new / "photos", groups, progress)
             else:
-                tasks.extract(database, photos, masks)
+                tasks.extract(database, photos, masks, as_stored)
             extracted = time.perf_counter()
             chosen = [(names[i], names[j]) for i, j in pairs.select_pairs(database, names, most, progress)]
             if local:
@@ -98,7 +100,7 @@ def build_features(
 
 
 def _key(
-    photos: list[Path], lenses: list[Lens | None], search: tuple[int, int], masks: list[Path | None] | None
+    photos: list[Path], lenses: list[Lens | None], search: tuple[int, ...], masks: list[Path | None] | None
 ) -> str:
     paths = [*photos, *(mask for mask in masks or () if mask is not None)]
     files = [(str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns) for path in paths]

@@ -38,7 +38,13 @@ class FeatureTasks:
     engine: Engine
     progress: Progress
 
-    def extract(self, database: Path, photos: Sequence[Path], masks: Sequence[Path | None] | None) -> None:
+    def extract(
+        self,
+        database: Path,
+        photos: Sequence[Path],
+        masks: Sequence[Path | None] | None,
+        as_stored: Sequence[bool] | None = None,
+    ) -> None:
         """Fills the database of imported photos with their features."""
         folders = []
         for first in range(0, len(photos), PHOTOS_A_TASK):
@@ -47,7 +53,7 @@ class FeatureTasks:
             if not has_task(folders[-1]):
                 paths = [str(photo.resolve()) for photo in photos[some]]
                 covered = None if masks is None else [mask and str(mask.resolve()) for mask in masks[some]]
-                write_task(folders[-1], photos=paths, masks=covered)
+                write_task(folders[-1], photos=paths, masks=covered, as_stored=as_stored and list(as_stored[some]))
         results = run_tasks(self.engine, extract_task, folders, "feature set", self.progress)
         with closing(sqlite3.connect(database)) as own, own:
             ids = iter(_images(own).values())
@@ -84,11 +90,11 @@ def extract_task(task: str, progress: Progress = QUIET) -> None:
     folder, facts = Path(task), read_facts(Path(task))
     if (folder / RESULT).is_dir():
         return
-    photos, masks = [Path(photo) for photo in facts["photos"]], facts["masks"]
+    photos, masks, as_stored = [Path(photo) for photo in facts["photos"]], facts["masks"], facts["as_stored"]
     with atomic_directory(folder / RESULT) as new:
-        names = stage_photos(new / "photos", photos, progress)
+        names = stage_photos(new / "photos", photos, progress, as_stored)
         if masks is not None:
-            stage_masks(new / "masks", photos, names, [mask and Path(mask) for mask in masks])
+            stage_masks(new / "masks", photos, names, [mask and Path(mask) for mask in masks], as_stored)
         groups = import_photos(new / DATABASE, new / "photos", photos, names, [None] * len(photos))
         extract(new / DATABASE, new / "photos", groups, progress)
 

@@ -12,7 +12,7 @@ from perception.errors import InputError
 from perception.photos.decode import why_left_out
 from perception.photos.ignore_masks import mask_of
 from perception.photos.lens import lens_from_camera
-from perception.photos.views import fit_lens, make_view
+from perception.photos.views import first_of, posed_view
 from perception.sfm.exposure import with_gains
 from perception.sfm.options import Cloud, ReadOptions
 from perception.sfm.tracks import tracks_of_model
@@ -20,25 +20,33 @@ from perception.types import View
 
 
 def views_of_model(
-    model: Any, located: dict[int, tuple[str, Path]], source: Path, options: ReadOptions
+    model: Any, located: dict[int, tuple[str, Path]], source: Path, options: ReadOptions, upright: bool = True
 ) -> tuple[list[View], dict[str, Any]]:
     """Views sorted by name, and facts: "left_out" with reasons, "warnings", "exposure". located: view name and photo by
-    image id. InputError when no photo is left."""
+    image id. upright: see `posed_view`. InputError when no photo is left."""
     views, missing, notes = [], [], set()
     lenses = {camera_id: lens_from_camera(camera) for camera_id, camera in model.cameras.items()}
     for image_id, (name, photo) in located.items():
         image = model.images[image_id]
-        missing_photo = "in the sparse model, but the photo is missing"
-        if why := why_left_out(photo, options.strict) if photo.is_file() else missing_photo:
-            missing.append({"name": name, "why": why})
+        if not photo.is_file():
+            missing.append({"name": name, "why": "in the sparse model, but the photo is missing"})
             continue
-        lens, note = fit_lens(lenses[image.camera_id], photo, source)
-        pose = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
-        views.append(replace(make_view(name, photo, lens, pose, source), mask=mask_of(options.masks, name)))
+        try:
+            why_left_out(photo, strict=True)
+            pose = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+            view, note = posed_view(name, photo, lenses[image.camera_id], pose, source, upright)
+        except InputError as error:
+            if options.strict:
+                raise
+            missing.append({"name": name, "why": str(error)})
+            continue
+        views.append(replace(view, mask=mask_of(options.masks, name)))
         if note:
             notes.add(note)
     if not views:
-        raise InputError(f"{source}: none of the {len(located)} photos of the sparse model is there")
+        raise InputError(
+            f"{source}: none of the {len(located)} photos of the sparse model can be used{first_of(missing)}"
+        )
     names = {image_id: name for image_id, (name, _) in located.items()}
     views.sort(key=lambda view: view.name)
     views, exposure = with_gains(views, tracks_of_model(model, views, names))

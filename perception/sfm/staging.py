@@ -7,6 +7,7 @@ bytes that are not UTF-8.
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -23,20 +24,24 @@ _FOCAL_LENGTH = (0x920A, 0xA405, 0xA20E, 0xA20F, 0xA210)
 """EXIF tags: focal length in mm, the same for 35 mm film, resolution of the focal plane in x and y and its unit."""
 
 
-def stage_photos(folder: Path, photos: list[Path], progress: Progress) -> list[str]:
+def stage_photos(
+    folder: Path, photos: list[Path], progress: Progress, as_stored: Sequence[bool] | None = None
+) -> list[str]:
     """Fills the new `folder`; returns the names there, in the order of `photos`, which is also their sorted order.
     Upright JPEG and PNG are linked. Others are written as PNG, which keeps the pixels of every 8-bit format (16 bits
-    become 8), with the EXIF data on the focal length, by several threads."""
+    become 8), with the EXIF data on the focal length, by several threads. as_stored: of each photo, whether its EXIF
+    rotation is not applied; None applies it to all."""
     folder.mkdir()
     names, converted = [], []
+    stored = as_stored or [False] * len(photos)
     for index, photo in enumerate(photos):
         with open_photo(photo) as image:
-            plain = exif_of(image, photo).get(ORIENTATION, 1) == 1 and image.mode in ("RGB", "L")
+            plain = (stored[index] or exif_of(image, photo).get(ORIENTATION, 1) == 1) and image.mode in ("RGB", "L")
             small = image.width * image.height <= LARGE_PIXELS
             suffix = _PLAIN.get(image.format or "") if plain and small else None
         names.append(f"{index:06d}{suffix or '.png'}")
         if suffix is None:
-            converted.append((photo, folder / names[-1]))
+            converted.append((photo, folder / names[-1], stored[index]))
         else:
             try:
                 (folder / names[-1]).symlink_to(photo.resolve())
@@ -48,11 +53,11 @@ def stage_photos(folder: Path, photos: list[Path], progress: Progress) -> list[s
     return names
 
 
-def _convert(photo: Path, target: Path) -> None:
+def _convert(photo: Path, target: Path, as_stored: bool) -> None:
     kept = Image.Exif()
     with open_photo(photo) as image:
         exif = exif_of(image, photo)
         kept.update({tag: exif[tag] for tag in _MAKE_AND_MODEL if tag in exif})
         lens = exif_of(image, photo, CAMERA_FOLDER)
         kept.get_ifd(CAMERA_FOLDER).update({tag: lens[tag] for tag in _FOCAL_LENGTH if tag in lens})
-    Image.fromarray(read_photo(photo)).save(target, compress_level=1, exif=kept)
+    Image.fromarray(read_photo(photo, as_stored)).save(target, compress_level=1, exif=kept)

@@ -34,7 +34,8 @@ def posed_scene(views: list[View], cloud: Cloud, facts: dict[str, Any], options:
     check = doubted or options.poses == "refine"
     if few or check:
         photos, lenses, masks = zip(*((view.photo, view_lens(view), view.mask) for view in views), strict=True)
-        store = build_features(list(photos), list(lenses), options, list(masks), posed=True)
+        as_stored = [view.as_stored for view in views]
+        store = build_features(list(photos), list(lenses), options, list(masks), posed=True, as_stored=as_stored)
         report["seconds"] = store.facts["seconds"]
         features = features_of(views, store)
         if check:

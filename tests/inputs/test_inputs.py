@@ -99,12 +99,15 @@ def test_bad_transforms_are_one_clear_line(tmp_path, changes, words):
     assert "\n" not in str(error.value)
 
 
-def test_nan_pose_is_refused(tmp_path):
+def test_one_frame_with_a_nan_pose_is_left_out(tmp_path):
     file, data = write_transforms(tmp_path)
     data["frames"][2]["transform_matrix"][0, 3] = np.nan
     file.write_text(json.dumps(data, default=lambda matrix: matrix.tolist()))
+    scene = load_scene(file, ReadOptions(tmp_path / "work"))
+    assert [view.name for view in scene.views] == ["0.png", "1.png"]
+    assert "NaN" in scene.report["left_out"][0]["why"] and scene.report["left_out"][0]["name"] == "2.png"
     with pytest.raises(InputError, match=r"images/2.png.*NaN"):
-        load_scene(file, ReadOptions(tmp_path / "work"))
+        load_scene(file, ReadOptions(tmp_path / "strict", strict=True))
 
 
 @pytest.mark.parametrize("suffix", ["bin", "txt"])
@@ -154,6 +157,9 @@ def test_folders_that_are_no_scene(tmp_path):
     camera = tmp_path / "camera.yaml"
     camera.write_text(CAMERA)
     with pytest.raises(InputError, match="camera file says 100×80"):
+        load_scene(tmp_path / "photos", ReadOptions(tmp_path / "work", camera=camera))
+    camera.write_text(CAMERA.replace("100", "241").replace("80", "161"))  # the photos are a quarter, rounded down
+    with pytest.raises(InputError, match="could be registered"):
         load_scene(tmp_path / "photos", ReadOptions(tmp_path / "work", camera=camera))
     data = (tmp_path / "photos" / "c.png").read_bytes()
     (tmp_path / "photos" / "c.png").write_bytes(data[: len(data) // 2])

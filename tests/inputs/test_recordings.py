@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -112,10 +113,10 @@ BAD = [
     ("tum", lambda s: (s / "groundtruth.txt").write_text("1 0 0 0 0 0 0 0"), "a quaternion is zero"),
     ("tum", lambda s: (s / "groundtruth.txt").write_text("1 0 x"), "expected lines of 8 numbers"),
     ("tum", lambda s: (s / "rgb.txt").write_text("abc"), "expected lines 'time file'"),
+    ("tum", lambda s: _edit(s / "groundtruth.txt", ".", ","), "has a decimal comma"),
+    ("scannet", lambda s: _edit(s / "intrinsic/intrinsic_color.txt", ".", ","), "has a decimal comma"),
     ("scannet", lambda s: shutil.rmtree(s / "intrinsic"), "give --camera"),
     ("scannet", lambda s: np.savetxt(s / "intrinsic/intrinsic_color.txt", np.eye(4) * 900), "were they resized"),
-    ("scannet", lambda s: np.savetxt(s / "pose/0.txt", np.diag([-1.0, 1, 1, 1])), "mirrored"),
-    ("scannet", lambda s: np.savetxt(s / "pose/3.txt", 2 * np.eye(4)), "not a rigid transform"),
     ("scannet", lambda s: np.savetxt(s / "pose/3.txt", np.eye(3)), "expected lines of 4 numbers"),
     ("scannet", lambda s: shutil.rmtree(s / "depth"), "no photo has a depth image"),
     ("7scenes", lambda s: _depth(s, 0), "hold nothing measured"),
@@ -139,6 +140,62 @@ def test_bad_recordings_are_one_line(layout: str, damage, words: str, tmp_path: 
             load_scene(source, ReadOptions(tmp_path / "work"))
         loaded(source, tmp_path)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("matrix", [np.diag([-1.0, 1, 1, 1]), 2 * np.eye(4)], ids=["mirrored", "scaled"])
+def test_one_frame_with_a_wrong_pose_is_left_out(matrix: np.ndarray, tmp_path: Path) -> None:
+    source = write_recording(tmp_path, "scannet")
+    np.savetxt(source / "pose/3.txt", matrix)
+    scene = loaded(source, tmp_path)
+    assert len(scene.views) >= 7 and "color/3.png" not in {view.name for view in scene.views}
+    (entry,) = scene.report["left_out"]
+    assert entry["name"] == "color/3.png" and "not a rigid transform" in entry["why"]
+    with pytest.raises(InputError, match=r"color/3\.png is not a rigid"):
+        load_scene(source, ReadOptions(tmp_path / "strict", strict=True))
+
+
+def _backslashes(source: Path) -> None:
+    for name in ("rgb.txt", "depth.txt"):
+        _edit(source / name, "/", "\\")
+
+
+def _capitals(source: Path) -> None:
+    for name in ("rgb.txt", "depth.txt"):
+        _edit(source / name, ".png", ".PNG")
+
+
+def _marked(source: Path) -> None:
+    for name in ("rgb.txt", "depth.txt", "groundtruth.txt"):
+        (source / name).write_text((source / name).read_text(), encoding="utf-8-sig")
+
+
+def _blanks(source: Path) -> None:
+    (source / "rgb").rename(source / "my rgb")
+    _edit(source / "rgb.txt", " rgb", " my rgb")
+
+
+@pytest.mark.parametrize("change", [_backslashes, _capitals, _marked, _blanks])
+def test_lists_of_other_systems_give_the_same_scene(change: Callable[[Path], None], tmp_path: Path) -> None:
+    plain = loaded(write_recording(tmp_path, "tum"), tmp_path)
+    (tmp_path / "other").mkdir()
+    source = write_recording(tmp_path / "other", "tum")
+    change(source)
+    scene = loaded(source, tmp_path / "other")
+    assert [view.photo.name for view in scene.views] == [view.photo.name for view in plain.views]
+    for view, other in zip(plain.views, scene.views, strict=True):
+        np.testing.assert_array_equal(view.camera_from_world, other.camera_from_world)
+        assert other.depth is not None and view.depth is not None and other.depth.path.name == view.depth.path.name
+
+
+def test_a_row_of_nan_and_a_photo_that_is_missing_leave_the_rest(tmp_path: Path) -> None:
+    source = write_recording(tmp_path, "tum")
+    first = sorted((source / "rgb").iterdir())[0]
+    first.unlink()
+    rows = (source / "groundtruth.txt").read_text().splitlines()
+    time = rows[-1].split()[0]
+    (source / "groundtruth.txt").write_text("\n".join([*rows, f"{float(time) + 0.01} nan nan nan 0 0 0 1"]))
+    scene = loaded(source, tmp_path)
+    assert len(scene.views) >= 6 and f"rgb/{first.name}" not in {view.name for view in scene.views}
 
 
 def test_phone_depth_of_another_size_and_lenses_per_frame(tmp_path: Path) -> None:

@@ -176,8 +176,8 @@ def test_photos_above_the_limit_are_reduced_alike_everywhere(tmp_path: Path, mon
             means = whole.reshape(150, 2, 101, 2, 3).mean((1, 3))
             assert np.abs(photo[:150, :101] - means).max() <= 1
     lens = Lens("PINHOLE", (200.0, 200.0, 101.5, 150.5), 203, 301)
-    scaled, note = fit_lens(lens, file, tmp_path)
-    assert (scaled.width, scaled.height) == (102, 151) and note is not None
+    scaled = fit_lens(lens, file, as_stored=False)
+    assert scaled is not None and (scaled.width, scaled.height) == (102, 151)
     assert scaled.params[0] == pytest.approx(200 * 102 / 203)
     monkeypatch.setattr(photos_module, "MOST_DECODED", 50_000)
     assert "301×203 pixels" in str(why_left_out(tmp_path / "a.png"))
@@ -217,6 +217,59 @@ def test_heic_is_read(tmp_path: Path) -> None:
     assert np.abs(read_photo(file) - upright).max() == 0
     file.write_bytes(file.read_bytes()[:500])
     assert why_left_out(file) is not None
+
+
+def test_photos_of_given_poses_are_staged_as_stored(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    photos = [save(tmp_path / name, 0, exif=exif) for name in ("0.jpg", "1.tif")]
+    lens = Lens("PINHOLE", (100.0, 100.0, 80.0, 60.0), 160, 120)
+    options, masks = ReadOptions(tmp_path / "work"), [save(tmp_path / "mask.png", 1), None]
+    for as_stored in ([True, True], [False, False]):
+        store = build_features(photos, [lens, lens], options, masks, posed=True, as_stored=as_stored)
+        for photo, name in zip(photos, store.names, strict=True):
+            staged = np.asarray(Image.open(store.image_root / name)).astype(int)
+            expected = texture(0) if as_stored[0] else texture(0)[::-1, ::-1]
+            assert np.abs(staged - expected).mean() < 12, photo
+
+
+@pytest.mark.parametrize("kind", ["HEIF", "WEBP", "PNG", "TIFF", "AVIF"])
+def test_pictures_under_a_wrong_ending_are_read(kind: str, tmp_path: Path) -> None:
+    if kind == "HEIF":
+        pytest.importorskip("pillow_heif").register_heif_opener()
+    file = tmp_path / "IMG_1.jpg"
+    Image.fromarray(texture(0, (160, 128))).save(file, format=kind, quality=95)
+    assert why_left_out(file) is None and photo_size(file) == (160, 128)
+    assert np.abs(read_photo(file).astype(int) - texture(0, (160, 128))).mean() < 12  # the loss of the codecs
+
+
+def test_a_jpeg_called_heic_needs_no_reader_of_heic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    Image.fromarray(texture(0)).save(tmp_path / "IMG_1.HEIC", format="JPEG")
+    assert photo_size(tmp_path / "IMG_1.HEIC") == (160, 120)
+
+
+@pytest.mark.parametrize("folder", ["images_2", "images_4", "images_8", "thumbnails"])
+def test_smaller_copies_beside_the_photos_are_doubles(folder: str, tmp_path: Path) -> None:
+    share = {"images_4": 4, "images_8": 8}.get(folder, 2)
+    for index in range(4):
+        whole = Image.open(save(tmp_path / "images" / f"{index}.jpg", index, (270, 481), quality=95))
+        (tmp_path / folder).mkdir(exist_ok=True)
+        whole.resize((270 // share, 481 // share), Image.Resampling.BOX).save(tmp_path / folder / f"{index}.png")
+    chosen = choose_photos(tmp_path, False, Told())
+    assert chosen.names == [f"images/{index}.jpg" for index in range(4)]
+    assert all("the same picture as images/" in entry["why"] for entry in chosen.left_out)
+    assert "4 of 8 photos are doubles" in chosen.notes[0]
+
+
+def test_photos_of_one_name_that_show_different_things_all_stay(tmp_path: Path) -> None:
+    """As of two cameras: of equal size, or of another size and another view."""
+    save(tmp_path / "left" / "0.png", 0)
+    Image.fromarray(np.roll(texture(0), 3, axis=1)).save(save(tmp_path / "right" / "0.png", 1))
+    save(tmp_path / "small" / "0.png", 2, (80, 60))
+    assert choose_photos(tmp_path, False, Told()).names == ["left/0.png", "right/0.png", "small/0.png"]
 
 
 def test_heic_without_its_reader_names_the_line_that_installs_it(

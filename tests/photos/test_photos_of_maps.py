@@ -98,6 +98,8 @@ def test_relink_finds_photos_by_name_and_size(path: Path, capsys: pytest.Capture
     deeper.mkdir(parents=True)
     (new / "s" / "00000.png").rename(deeper / "00000.png")
     assert relink(path, path.parents[1] / "disk")["linked"] == 1 and shown(path) == RED
+    (deeper / "00000.png").rename(deeper / "00000.PNG")  # by way of a disk that does not tell them apart
+    assert relink(path, path.parents[1] / "disk")["linked"] == 1 and shown(path) == RED
 
 
 def test_relink_refuses_a_folder_without_the_photos(path: Path) -> None:
