@@ -278,7 +278,8 @@ def write_export(
 ) -> dict[str, Any]:
     """Writes the cloud with `instance_id` and its sidecar JSON (same stem); returns the sidecar.
 
-    labels [P] int32, −1 = none; points, order and other columns are the cloud's own. instances: {id: {"score", "label"}} of the map.
+    labels [P] int32, −1 = none; points, order and other columns are the cloud's own. instances: {id: {"score",
+    "label"}} of the map.
     Entries have "score", "label", "num_points"; those of parts also their `parent`, of groups the `instances` in them.
     facts: further keys of the sidecar.
     """

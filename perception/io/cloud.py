@@ -29,8 +29,8 @@ _EXACT = 2**53
 """Whole numbers up to this are exact as doubles."""
 _ASIDE = 0.95
 """Share of floating-point colours by whose largest their unit is seen: lights may exceed it."""
-_SOME = 1 << 20
-"""Points of which the unit of colours is seen."""
+_SOME = 1 << 16
+"""Points of which the unit of colours is seen, and faces that are split at a time."""
 _PCD_KINDS = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
 _PCD_COLUMNS, _PCD_LINE = 1 << 12, 1 << 14
 _LZF_DENSEST = 88
@@ -169,7 +169,7 @@ def _write_ply_cloud(path: Path, cloud: PointCloud) -> None:
 def _triangles(faces: np.ndarray | Lists, vertices: int, path: Path) -> np.ndarray:
     """Triangles [F, 3] int32 of faces with any number of corners, each split into a fan, in order."""
     values = faces.values if isinstance(faces, Lists) else faces
-    low, high = values.min(initial=0), values.max(initial=-1)
+    low, high = (values.min(), values.max()) if values.size else (0, -1)
     if low < 0 or high >= vertices:
         raise InputError(f"{path}: a face names vertex {low if low < 0 else high}, but there are {vertices} vertices")
     if isinstance(faces, Lists):
@@ -184,16 +184,19 @@ def _triangles(faces: np.ndarray | Lists, vertices: int, path: Path) -> np.ndarr
 
 def _fans(faces: Lists) -> np.ndarray:
     """`_triangles` of faces of different numbers of corners."""
-    counts = faces.counts.astype(np.int64)
-    fans, starts = np.maximum(counts - 2, 0), np.cumsum(counts) - counts
-    found, at = np.empty((int(fans.sum()), 3), np.int32), 0
-    for begin in range(0, len(counts), _SOME):
-        n = fans[begin : begin + _SOME]
-        first = np.repeat(starts[begin : begin + _SOME], n)
+    found, at, corner = (
+        np.empty((int(np.maximum(faces.counts, 2).sum(dtype=np.int64)) - 2 * len(faces), 3), np.int32),
+        0,
+        0,
+    )
+    for begin in range(0, len(faces), _SOME):
+        counts = faces.counts[begin : begin + _SOME].astype(np.int64)
+        n = np.maximum(counts - 2, 0)
+        first = np.repeat(corner + np.cumsum(counts) - counts, n)
         step = np.arange(len(first)) - np.repeat(np.cumsum(n) - n, n) + 1
         part = found[at : at + len(first)]
         part[:, 0], part[:, 1], part[:, 2] = (faces.values[i] for i in (first, first + step, first + step + 1))
-        at += len(first)
+        at, corner = at + len(first), corner + int(counts.sum())
     return found
 
 
@@ -241,7 +244,7 @@ def _read_pcd(path: Path) -> PointCloud:
             table = _pcd_table(header, left if kind == "binary" else None)
             if kind == "binary_compressed":
                 columns = _by_column(_unpacked(file, path), table)
-        except (KeyError, IndexError, ValueError) as error:
+        except (KeyError, IndexError, ValueError, struct.error) as error:
             raise InputError(f"{path}: PCD cannot be understood ({error})") from error
         if kind != "binary_compressed":
             columns = read_body(path, file, "<" if kind == "binary" else "", [table])[table.name]

@@ -44,7 +44,7 @@ _CODES = dict(zip(("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f2", "f4", "
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 _MAX_HEADER = 1 << 20
 MOST_ROWS = 1 << 40
-_PIECE = 1 << 18
+_PIECE = 1 << 15
 """Rows of different sizes that are gathered at a time."""
 _MSVC_NAN = re.compile(rb"-?1\.#[A-Z]+[0-9]*")
 """How programs of older Visual C++ write numbers that are not finite."""
@@ -218,38 +218,37 @@ class _Body:
         return [np.frombuffer(found, np.uint32) if found else np.empty(0, np.uint32) for *_, found in steps]
 
     def ragged(self, table: Table) -> Element:
-        """All rows, of which lists differ in length, in pieces."""
-        start = self.at
-        lengths = self.lengths(table, table.rows)
-        pieces: list[list[np.ndarray]] = [[] for _ in table.properties]
+        """All rows, of which lists differ in length, gathered in pieces."""
+        end, body = self.at, np.frombuffer(self.body, np.uint8)
+        lengths = iter(self.lengths(table, table.rows))
+        counts = [next(lengths) if p.count else None for p in table.properties]
+        totals = [table.rows if n is None else int(n.sum(dtype=np.int64)) for n in counts]
+        columns = [np.empty(n, p.kind) for n, p in zip(totals, table.properties, strict=True)]
+        filled = [0] * len(columns)
         for begin in range(0, table.rows, _PIECE):
-            counts = [n[begin : begin + _PIECE] for n in lengths]
-            start = self._gather(table, counts, start, pieces)
-        left, columns = iter(lengths), []
-        for p, parts in zip(table.properties, pieces, strict=True):
-            values = np.concatenate(parts)
-            columns.append((p.name, Lists(values, next(left)) if p.count else values))
-        return dict(reversed(columns))
-
-    def _gather(self, table: Table, counts: list[np.ndarray], start: int, pieces: list[list[np.ndarray]]) -> int:
-        """Adds the values of rows that begin at `start`, of lists of lengths `counts`; returns where the rows end."""
-        left = iter(counts)
-        sizes = [(np.dtype(self._stored(p.kind)).itemsize, next(left) if p.count else None) for p in table.properties]
-        heads = [np.dtype(self._stored(p.count)).itemsize if p.count else 0 for p in table.properties]
-        total = sum(
-            head + size * (1 if n is None else n.astype(np.int64)) for head, (size, n) in zip(heads, sizes, strict=True)
-        )
-        ends = start + np.cumsum(total)
-        at = ends - total
-        for p, head, (size, n), parts in zip(table.properties, heads, sizes, pieces, strict=True):
-            at, spots = at + head, at + head
-            if n is not None:
-                before = np.cumsum(n, dtype=np.int64) - n
-                spots = np.repeat(at - size * before, n) + size * np.arange(n.sum(dtype=np.int64))
-            values = np.frombuffer(self.body, np.uint8)[spots[:, None] + np.arange(size)]
-            parts.append(_cast(values.view(self._stored(p.kind))[:, 0], p.kind))
-            at = at + size * (1 if n is None else n.astype(np.int64))
-        return int(ends[-1])
+            some = [None if n is None else n[begin : begin + _PIECE].astype(np.int64) for n in counts]
+            one = np.ones(min(_PIECE, table.rows - begin), np.int64)
+            layout = [
+                (np.dtype(self._stored(p.count)).itemsize if p.count else 0, np.dtype(self._stored(p.kind)), n)
+                for p, n in zip(table.properties, some, strict=True)
+            ]
+            sizes = sum((head + kind.itemsize * (one if n is None else n) for head, kind, n in layout), 0 * one)
+            at = end + np.cumsum(sizes) - sizes  # where the property of each row begins
+            end += int(sizes.sum())
+            for i, (head, kind, n) in enumerate(layout):
+                n = one if n is None else n
+                first = np.repeat(at + head - kind.itemsize * (np.cumsum(n) - n), n)
+                spots = first + kind.itemsize * np.arange(len(first))
+                columns[i][filled[i] : filled[i] + len(spots)] = body[spots[:, None] + np.arange(kind.itemsize)].view(
+                    kind
+                )[:, 0]
+                filled[i] += len(spots)
+                at += head + kind.itemsize * n
+        found: list[tuple[str, np.ndarray | Lists]] = [
+            (p.name, values if n is None else Lists(values, n))
+            for p, values, n in zip(table.properties, columns, counts, strict=True)
+        ]
+        return dict(reversed(found))
 
     def _stored(self, kind: str) -> str:
         return "f8" if self.text else self.order + kind

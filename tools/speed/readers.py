@@ -8,7 +8,6 @@ Each file is read in a process of its own: the peak is what it has beyond its im
 from __future__ import annotations
 
 import argparse
-import resource
 import subprocess
 import sys
 import tempfile
@@ -69,12 +68,18 @@ def make(path: Path, kind: str, points: int) -> None:
                 rows.tofile(file)
 
 
+def peak() -> int:
+    """Most bytes of memory that this process has had (Linux). `ru_maxrss` would begin with those of its parent."""
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    return 1024 * int(status.split("VmHWM:")[1].split()[0])
+
+
 def read(path: Path) -> None:
     from perception.io.cloud import read_cloud
 
-    before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, time.process_time()
+    before, start = peak(), time.process_time()
     cloud = read_cloud(path)
-    more, size = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before, path.stat().st_size
+    more, size = peak() - before, path.stat().st_size
     faces = 0 if cloud.faces is None else len(cloud.faces)
     print(
         f"{path.name}: {len(cloud.points)} points, {faces} triangles, {size / 1e6:.0f} MB: peak {more / 1e6:.0f} MB, "
