@@ -288,8 +288,9 @@ def _by_column(data: bytes, table: Table) -> Element:
 def _unpacked(file: BinaryIO, path: Path) -> bytes:
     """The bytes of binary_compressed: two lengths, packed and unpacked, and LibLZF's code. A byte c < 32 begins c + 1
     bytes as they are; else they repeat (c >> 5) + 2 bytes (7: and the next byte's) from at most 8192 bytes before."""
-    packed, size = struct.unpack("<II", file.read(8))
-    code, out, at = file.read(packed), bytearray(), 0
+    data = memoryview(file.read())
+    packed, size = struct.unpack_from("<II", data)
+    code, out, at = data[8 : 8 + packed], bytearray(), 0
     if len(code) < packed or size > _LZF_DENSEST * packed:
         raise ValueError(f"{len(code)} of {packed} packed bytes are there, for {size}")
     require_memory(2 * size, str(path), "use a machine with more memory")

@@ -239,9 +239,8 @@ class _Body:
                 n = one if n is None else n
                 first = np.repeat(at + head - kind.itemsize * (np.cumsum(n) - n), n)
                 spots = first + kind.itemsize * np.arange(len(first))
-                columns[i][filled[i] : filled[i] + len(spots)] = body[spots[:, None] + np.arange(kind.itemsize)].view(
-                    kind
-                )[:, 0]
+                values = body[spots[:, None] + np.arange(kind.itemsize)].view(kind)[:, 0]
+                columns[i][filled[i] : filled[i] + len(spots)] = _cast(values, table.properties[i].kind)
                 filled[i] += len(spots)
                 at += head + kind.itemsize * n
         found: list[tuple[str, np.ndarray | Lists]] = [
