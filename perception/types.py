@@ -108,7 +108,8 @@ class OrientedBox:
 class PointCloud:
     """Points as read, order kept. points [P, 3] float32 or float64; the rest may be None.
 
-    colors [P, 3] uint8, normals [P, 3] float32, faces [F, 3] int32 (mesh), labels: named per-point int32 arrays.
+    colors [P, 3] uint8, normals [P, 3] float32, faces [F, 3] int32 (mesh), labels: further columns [P] of numbers by
+    name, in the type that the file has.
     """
 
     points: np.ndarray

@@ -9,13 +9,13 @@ from typing import Any
 import cv2
 import numpy as np
 
+from perception.bags.cameras import depth_camera
 from perception.bags.poses import Poses
-from perception.bags.read import CAMERA_INFO, DEPTH_TRANSPORT, IMAGES, Bag, camera_of, raw_rows, stamp_of
+from perception.bags.read import DEPTH_TRANSPORT, IMAGES, Bag, first_frame, frame_of, kind_of, raw_rows, stamp_of
 from perception.errors import InputError
-from perception.photos.camera_file import camera_info, lens_of
 from perception.photos.decode import read_picture
 from perception.photos.depth import measured
-from perception.photos.lens import camera_from_lens, rescale_lens
+from perception.photos.lens import camera_from_lens, rescale_lens, same_aspect
 from perception.types import Lens
 
 APART = 0.03
@@ -26,19 +26,30 @@ _SAME_LENS = 0.01
 """Largest relative difference between focal lengths for which depth in the photos' frame counts as registered."""
 _HEADER = struct.Struct("<iff")
 """Begins a message of compressedDepth: the format, a and b, of which 32FC1 stores v = a / depth + b as PNG."""
+_PNG = b"\x89PNG\r\n\x1a\n"
 _NAMED = ("aligned", "registered")
-_TYPES = {"16UC1": "u2", "32FC1": "f4"}
+_TYPES = {"16UC1": "u2", "mono16": "u2", "16SC1": "i2", "32FC1": "f4", "64FC1": "f8", "mono8": "u1", "8UC1": "u1"}
+_DEPTH = ("16UC1", "16SC1", "32FC1", "64FC1")
+"""Encodings of nothing but depth; pictures share the others."""
 
 
 def depth_topics(bag: Bag) -> list[str]:
-    """Topics whose first message is a depth image: 16UC1 or 32FC1, raw or by the transport compressedDepth."""
-    found = []
-    for topic in bag.of_type(*IMAGES):
-        first = next(bag.messages([topic]), None)
-        kind = "" if first is None else str(getattr(first[2], "encoding", None) or first[2].format)
-        if DEPTH_TRANSPORT in kind or kind.startswith(("16UC1", "32FC1")):
-            found.append(topic)
-    return found
+    """Topics of depth images, by their first message: see `_holds_depth`."""
+    firsts = ((topic, next(bag.messages([topic]), None)) for topic in bag.of_type(*IMAGES))
+    return [topic for topic, first in firsts if first is not None and _holds_depth(topic, first.message)]
+
+
+def _holds_depth(topic: str, message: Any) -> bool:
+    """Whether an image is encoded as depth is, or has one channel and a topic that is named depth."""
+    kind = kind_of(message)
+    if DEPTH_TRANSPORT in kind or topic.endswith(DEPTH_TRANSPORT) or kind.startswith(_DEPTH):
+        return True
+    if "depth" not in topic.lower() or hasattr(message, "encoding"):
+        return "depth" in topic.lower() and kind in _TYPES
+    try:
+        return read_picture(bytes(message.data), topic, "image").ndim == 2
+    except InputError:
+        return False
 
 
 def choose_depth(bag: Bag, topics: list[str], wanted: str | None, frame: str) -> str | None:
@@ -46,9 +57,11 @@ def choose_depth(bag: Bag, topics: list[str], wanted: str | None, frame: str) ->
     Preferred: in the photos' frame, then named aligned or registered, then not compressed."""
     if wanted == "none" or not (topics or wanted):
         return None
+    if wanted in bag.of_type(*IMAGES):
+        return wanted
 
     def rank(topic: str) -> tuple[bool, bool, bool]:
-        other = _frame_of(next(bag.messages([topic]))[2]) != frame.lstrip("/")
+        other = first_frame(bag, topic) != frame
         return other, not any(word in topic for word in _NAMED), topic.endswith(DEPTH_TRANSPORT)
 
     ranks = {topic: rank(topic) for topic in topics}
@@ -57,18 +70,23 @@ def choose_depth(bag: Bag, topics: list[str], wanted: str | None, frame: str) ->
 
 
 def decode_depth(message: Any, where: str) -> np.ndarray:
-    """Depth [h, w] float32 in metres, 0 = nothing measured. 16UC1 holds millimetres, 32FC1 metres (ROS REP 118)."""
-    kind = str(getattr(message, "encoding", None) or message.format)
+    """Depth [h, w] float32 in metres, 0 = nothing measured. 16-bit images hold millimetres, floats metres (REP 118)."""
+    kind, data, at = kind_of(message), bytes(message.data), 0
     what = f"depth image of format '{kind}'; expected png of one channel"
-    data = bytes(message.data)
     if hasattr(message, "encoding"):
         if kind not in _TYPES:
             raise InputError(f"{where}: depth is encoded as '{kind}'; expected 16UC1 (mm) or 32FC1 (m)")
         dtype = np.dtype(_TYPES[kind]).newbyteorder(">" if message.is_bigendian else "<")
         image = raw_rows(message, dtype.itemsize, where).view(dtype)
     else:
-        image = read_picture(data[_HEADER.size :] if DEPTH_TRANSPORT in kind else data, where, what)
-    if DEPTH_TRANSPORT in kind and kind.startswith("32FC1"):
+        at = _HEADER.size if data.startswith(_PNG, _HEADER.size) else 0  # whatever the format is named
+        image = read_picture(data[at:], where, what)
+    if image.dtype.itemsize == 1:
+        found = f"holds 8 bits per pixel (format '{kind}'), which is a picture and no depth"
+        raise InputError(f"{where}: {found}; record depth as 16UC1 or 32FC1, raw or by {DEPTH_TRANSPORT}")
+    if kind.startswith("32FC1") and image.dtype.kind != "f":
+        if not at:
+            raise InputError(f"{where}: 32FC1 is stored as whole numbers of an unknown unit; record {DEPTH_TRANSPORT}")
         _, a, b = _HEADER.unpack_from(data)
         with np.errstate(divide="ignore", invalid="ignore"):
             image = np.where(image > 0, a / (image.astype(np.float32) - b), 0).astype(np.float32)
@@ -102,45 +120,34 @@ def write_depth(
     """Writes the depth image nearest in time to each photo, 16-bit PNG in millimetres: file by photo, and a text.
     stamps: times of the photos in ns. lens, frame: of the photos. Depth of another frame or lens is registered by its
     camera_info and tf; InputError where these are missing."""
-    own = _depth_lens(bag, topic)
-    times = np.array([stamp_of(message) or recorded for _, recorded, message in bag.messages([topic])])
-    nearest = {name: int(np.abs(times - stamp).argmin()) for name, stamp in stamps.items()}
-    apart = {name: abs(int(times[index]) - stamps[name]) / 1e9 for name, index in nearest.items()}
-    written = {name: f"{folder.name}/{Path(name).stem}.png" for name in stamps if apart[name] <= APART}
-    if not written:
+    own = depth_camera(bag, topic)
+    times = {one.number: stamp_of(one.message) or one.time for one in bag.messages([topic])}
+    if not times:
+        raise InputError("; ".join([f"{bag.path}: {topic} holds no depth image", *bag.lines()]))
+    numbers, at = np.array(list(times)), np.array(list(times.values()))
+    nearest = {name: int(numbers[np.abs(at - stamp).argmin()]) for name, stamp in stamps.items()}
+    apart = {name: abs(times[number] - stamps[name]) / 1e9 for name, number in nearest.items()}
+    near = [name for name in stamps if apart[name] <= APART]
+    if not near:
         found = f"no image of {topic} lies within {APART} s of a photo (the nearest: {min(apart.values()):.3g} s)"
         raise InputError(f"{bag.path}: {found}; give another --depth, or --depth none")
     folder.mkdir()
-    for index, (_, recorded, message) in enumerate(bag.messages([topic])):
-        names = [name for name in written if nearest[name] == index]
-        if not names:
-            continue
-        depth, there = decode_depth(message, f"{bag.path}: {topic}"), _frame_of(message)
-        if there != frame.lstrip("/") or (own is not None and not _same(own, lens)):
-            moved = poses.between(frame, there, stamp_of(message) or recorded)
+    written = dict[str, str]()
+    for one, depth in bag.decoded(topic, decode_depth, {nearest[name] for name in near}):
+        there, size = frame_of(one.message), depth.shape[::-1]
+        if there != frame or not (same_aspect(size, (lens.width, lens.height)) if own is None else _same(own, lens)):
+            moved = poses.between(frame, there, times[one.number]) if frame and there else None
             if own is None or moved is None:
                 lacks = "a camera_info" if own is None else f"tf from '{there}' to '{frame}'"
                 raise InputError(f"{bag.path}: {topic} is not registered to the photos and lacks {lacks}")
             depth = registered(depth, own, lens, moved)
         stored = np.round(depth * MILLIMETRES)
         data = cv2.imencode(".png", np.where(stored <= LARGEST, stored, 0).astype(np.uint16))[1].tobytes()
-        for name in names:
+        for name in (name for name in near if nearest[name] == one.number):
+            written[name] = f"{folder.name}/{Path(name).stem}.png"
             (folder.parent / written[name]).write_bytes(data)
     most = max(apart[name] for name in written)
     return written, f"{topic}, {len(written)} of {len(stamps)} photos, at most {1000 * most:.0f} ms apart"
-
-
-def _frame_of(message: Any) -> str:
-    return str(message.header.frame_id).lstrip("/")
-
-
-def _depth_lens(bag: Bag, topic: str) -> Lens | None:
-    name, rectified = camera_of(topic)
-    if name not in bag.of_type(CAMERA_INFO):
-        return None
-    for _, _, message in bag.messages([name]):
-        return lens_of(camera_info(message, rectified), f"{bag.path}: {name}")
-    return None
 
 
 def _same(a: Lens, b: Lens) -> bool:

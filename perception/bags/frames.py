@@ -5,23 +5,27 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from perception.bags.cameras import image_camera
 from perception.bags.depth import MILLIMETRES, choose_depth, depth_topics, write_depth
 from perception.bags.poses import FIXED_FRAMES, Poses, gravity, read_poses
-from perception.bags.read import CAMERA_INFO, IMAGES, Bag, camera_of, decode_image, encoded, open_bag, stamp_of
+from perception.bags.read import IMAGES, Bag, decode_image, encoded, frame_of, open_bag, stamp_of
 from perception.errors import InputError
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
 from perception.io.atomic import atomic_directory
 from perception.map.outputs import check_empty
-from perception.photos.camera_file import camera_info, read_camera, write_camera
+from perception.photos.camera_file import lens_of, read_camera, write_camera
 from perception.photos.lens import FISHEYE, PERSPECTIVE
 from perception.photos.video import Chooser
 from perception.types import Lens
+
+Decoder = Callable[[Any, str], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,7 @@ class FrameOptions:
 
     camera: file that replaces camera_info. fixed_frame: the world frame (None: map, odom, world, or the root of the
     tree). depth: topic, or "none" (None: the one registered to the images, else the only one). max_frames, spacing: see
-    Chooser.
+    Chooser. strict: a message that cannot be used is an InputError; otherwise it is left out, counted and named.
     """
 
     topic: str | None = None
@@ -40,6 +44,7 @@ class FrameOptions:
     depth: str | None = None
     max_frames: int = 200
     spacing: float = 0.08
+    strict: bool = False
 
 
 def run_frames(source: Path, output: Path, options: FrameOptions | None = None) -> tuple[dict[str, Any], str]:
@@ -49,34 +54,39 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
     check_empty(output)
     if options.max_frames < 2 or not options.spacing > 0:
         raise InputError(f"--max-frames {options.max_frames}, --spacing {options.spacing}: expected 2 or more, above 0")
-    with open_bag(source) as bag:
+    with open_bag(source, options.strict) as bag:
         depths = depth_topics(bag)
         images = bag.of_type(*IMAGES)
         if not images:
             raise InputError(f"{bag.path}: holds no images; its topics are {', '.join(sorted(bag.topics)) or 'none'}")
-        topic = bag.chosen([t for t in images if t not in depths] or images, options.topic, "image", "--topic")
-        info = None if options.camera is not None else _camera_info(bag, topic, options.camera_info)
-        chooser = Chooser(options.spacing)
-        size = None
-        for _, _, message in bag.messages([topic]):
-            picture = decode_image(message, f"{source}: {topic}")
-            size = size or (picture.shape[1], picture.shape[0])
+        pictures = images if options.topic else [t for t in images if t not in depths] or images
+        topic = bag.chosen(pictures, options.topic, "image", "--topic")
+        info = {} if options.camera is not None else image_camera(bag, topic, options.camera_info)
+        lens = lens_of(info, topic) if options.camera is None else read_camera(options.camera)
+        decode = _decoder(lens)
+        chooser, numbers = Chooser(options.spacing), list[int]()
+        for one, picture in bag.decoded(topic, decode):
+            numbers.append(one.number)
             chooser.show(picture)
-        if size is None:
-            raise InputError(f"{source}: {topic} holds no images")
-        chosen = chooser.chosen(options.max_frames)
+        if not numbers:
+            raise InputError("; ".join([f"{source}: {topic} holds no images", *bag.lines()]))
+        chosen = {numbers[index] for index in chooser.chosen(options.max_frames)}
         poses = read_poses(bag)
         with atomic_directory(output, fresh=True) as aside:
-            lens = _write_camera(aside / "camera.yaml", options.camera, info, topic, size, source)
-            stamps, frame = _write_images(bag, topic, chosen, aside / "images")
+            if options.camera is None:
+                write_camera(aside / "camera.yaml", info)
+            else:
+                shutil.copyfile(options.camera, aside / "camera.yaml")
+            stamps, frame = _write_images(bag, topic, decode, chosen, aside / "images")
             depth, source_of_depth = dict[str, str](), None
             try:
-                measured = choose_depth(bag, depths, options.depth, frame)
+                measured = choose_depth(bag, [t for t in depths if t != topic], options.depth, frame)
                 if measured is not None:
                     depth, source_of_depth = write_depth(bag, measured, stamps, lens, frame, poses, aside / "depth")
             except InputError as error:  # depth that no option names and that cannot be used is left out
-                if options.depth is not None:
+                if options.depth is not None or options.strict:
                     raise
+                bag.left_out.pop(str(measured), None)
                 shutil.rmtree(aside / "depth", ignore_errors=True)
                 source_of_depth = f"left out: {error}"
             known, fixed = _camera_poses(poses, stamps, frame, options.fixed_frame)
@@ -94,52 +104,40 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
         "with_pose": len(known),
         "fixed_frame": fixed,
         "camera_frame": frame,
-        "size": list(size),
+        "size": [lens.width, lens.height],
         "camera_model": lens.model,
         "depth": source_of_depth,
         "with_depth": len(depth),
+        "left_out": bag.lines(),
         **vertical,
     }
     return facts, _text(facts)
 
 
-def _camera_info(bag: Bag, topic: str, wanted: str | None) -> Any:
-    """The first CameraInfo of the camera that publishes `topic`."""
-    topics, (beside, _) = bag.of_type(CAMERA_INFO), camera_of(topic)
-    name = wanted or (topics[0] if len(topics) == 1 else beside)
-    if name not in topics:
-        advice = "give its topic with --camera-info, or a camera file with --camera (perception calibrate makes one)"
-        raise InputError(f"{bag.path}: has no camera_info '{name}' (found {', '.join(topics) or 'none'}); {advice}")
-    for _, _, message in bag.messages([name]):
-        return message
-    raise InputError(f"{bag.path}: {name} holds no message; give a camera file with --camera")
+def _decoder(lens: Lens) -> Decoder:
+    """`decode_image` that refuses images of another size than the camera's."""
+
+    def decode(message: Any, where: str) -> np.ndarray:
+        picture = decode_image(message, where)
+        height, width = picture.shape[:2]
+        if (width, height) != (lens.width, lens.height):
+            found = f"an image is {width}x{height} pixels, the camera {lens.width}x{lens.height}"
+            raise InputError(f"{where}: {found}; give the camera_info of these images")
+        return picture
+
+    return decode
 
 
-def _write_camera(path: Path, camera: Path | None, info: Any, topic: str, size: tuple[int, int], source: Path) -> Lens:
-    if camera is not None:
-        path.write_bytes(Path(camera).read_bytes() if Path(camera).is_file() else b"")
-        lens = read_camera(camera)
-    else:
-        write_camera(path, camera_info(info, rectified=camera_of(topic)[1]))
-        lens = read_camera(path)
-    if (lens.width, lens.height) != size:
-        found = f"images of {topic} are {size[0]}x{size[1]} pixels, the camera {lens.width}x{lens.height}"
-        raise InputError(f"{source}: {found}; give the camera_info of these images")
-    return lens
-
-
-def _write_images(bag: Bag, topic: str, chosen: list[int], folder: Path) -> tuple[dict[str, int], str]:
+def _write_images(bag: Bag, topic: str, decode: Decoder, chosen: set[int], folder: Path) -> tuple[dict[str, int], str]:
     """Writes the chosen images. Returns their times in ns by name, in order, and the camera frame."""
     folder.mkdir()
-    wanted, stamps, frame = set(chosen), {}, ""
-    for number, (_, recorded, message) in enumerate(bag.messages([topic])):
-        if number not in wanted:
-            continue
-        suffix, data = encoded(message, decode_image(message, f"{bag.path}: {topic}"))
-        name = f"{number:06d}{suffix}"
+    stamps, frame = dict[str, int](), ""
+    for one, picture in bag.decoded(topic, decode, chosen):
+        suffix, data = encoded(one.message, picture)
+        name = f"{one.number:06d}{suffix}"
         (folder / name).write_bytes(data)
-        stamps[name] = stamp_of(message) or recorded
-        frame = str(message.header.frame_id)
+        stamps[name] = stamp_of(one.message) or one.time
+        frame = frame_of(one.message)
     return stamps, frame
 
 
@@ -184,6 +182,8 @@ def _text(facts: dict[str, Any]) -> str:
     line = f"{folder}: {facts['chosen']} of {facts['images']} images of {facts['topic']}, {facts['camera_model']}"
     if facts["with_pose"]:
         line += f"; {facts['with_pose']} with a pose in '{facts['fixed_frame']}'"
+    if facts["left_out"]:
+        line += "\n" + "\n".join(facts["left_out"])
     if facts["depth"]:
         line += f"\ndepth: {facts['depth']}"
     if facts["gravity"]:

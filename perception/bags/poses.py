@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from perception.bags.read import ODOMETRY, TRANSFORMS, Bag, stamp_of
+from perception.bags.read import ODOMETRY, TRANSFORMS, Bag, Recorded, stamp_of
 from perception.geometry import interpolated_pose, inverse_se3
 
 FIXED_FRAMES = ("map", "odom", "world")
@@ -81,21 +81,30 @@ class Poses:
 def read_poses(bag: Bag) -> Poses:
     """All transforms of a bag; odometry adds frames that tf does not define."""
     poses = Poses()
-    for topic, _, message in bag.messages(bag.of_type(*TRANSFORMS)):
-        for entry in message.transforms:
-            t, q = entry.transform.translation, entry.transform.rotation
-            static = topic.rstrip("/").endswith("static")
-            poses.add(entry.header.frame_id, entry.child_frame_id, stamp_of(entry), _matrix(t, q), static)
-    for _, _, message in bag.messages(bag.of_type(ODOMETRY)):
-        pose = message.pose.pose
-        child = message.child_frame_id or "base_link"
-        poses.add(message.header.frame_id, child, stamp_of(message), _matrix(pose.position, pose.orientation))
+
+    def add(one: Recorded, entry: Any, child: str, position: Any, quaternion: Any, static: bool = False) -> None:
+        matrix = _matrix(position, quaternion)
+        if matrix is None:
+            bag.leave_out(one.topic, one.number, f"the pose of '{child}' is not finite")
+        else:
+            poses.add(entry.header.frame_id, child, stamp_of(entry), matrix, static)
+
+    for one in bag.messages(bag.of_type(*TRANSFORMS)):
+        for entry in one.message.transforms:
+            static = one.topic.rstrip("/").endswith("static")
+            add(one, entry, entry.child_frame_id, entry.transform.translation, entry.transform.rotation, static)
+    for one in bag.messages(bag.of_type(ODOMETRY)):
+        pose, child = one.message.pose.pose, one.message.child_frame_id or "base_link"
+        add(one, one.message, child, pose.position, pose.orientation)
     return poses
 
 
-def _matrix(position: Any, quaternion: Any) -> np.ndarray:
+def _matrix(position: Any, quaternion: Any) -> np.ndarray | None:
+    """[4, 4]; None for numbers that are not finite."""
     matrix = np.eye(4)
     xyzw = np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w])
+    if not np.isfinite([*xyzw, position.x, position.y, position.z]).all():
+        return None
     matrix[:3, :3] = Rotation.from_quat(xyzw if np.linalg.norm(xyzw) > 0 else [0, 0, 0, 1]).as_matrix()
     matrix[:3, 3] = position.x, position.y, position.z
     return matrix
@@ -108,12 +117,13 @@ def gravity(bag: Bag, poses: Poses, fixed: str) -> tuple[np.ndarray, float] | No
     into the world by tf and averaged; the error is the spread of the means of BLOCKS stretches of time, and BIAS_DEG.
     """
     samples = []
-    for _, recorded, message in bag.messages(bag.of_type(IMU)):
+    for one in bag.messages(bag.of_type(IMU)):
+        message = one.message
         vectors = (message.linear_acceleration, message.angular_velocity)
         push, turn = (np.array([v.x, v.y, v.z], np.float64) for v in vectors)
         size = float(np.linalg.norm(push))
         if abs(size - G) < STILL_PUSH and not np.linalg.norm(turn) > STILL_TURN:  # a gyroscope may be absent: NaN
-            samples.append((str(message.header.frame_id), stamp_of(message) or recorded, push / size))
+            samples.append((str(message.header.frame_id), stamp_of(message) or one.time, push / size))
     kept = np.unique(np.linspace(0, len(samples) - 1, min(len(samples), MOST_SAMPLES)).round().astype(int))
     ups = []
     for frame, time, push in (samples[index] for index in kept):

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -22,11 +23,22 @@ DEPTH_TRANSPORT = "compressedDepth"
 METADATA = "metadata.yaml"
 
 
-class Bag:
-    """An open bag. topics: message type by topic."""
+class Recorded(NamedTuple):
+    """A message, its number among those of its topic, and the time in ns at which it was recorded."""
 
-    def __init__(self, reader: Any, path: Path) -> None:
-        self._reader, self.path = reader, path
+    topic: str
+    number: int
+    time: int
+    message: Any
+
+
+class Bag:
+    """An open bag. topics: message type by topic. strict: a message that cannot be used is an InputError; otherwise it
+    is left out, and `left_out` has the reasons by topic and number."""
+
+    def __init__(self, reader: Any, path: Path, strict: bool = False) -> None:
+        self._reader, self.path, self.strict = reader, path, strict
+        self.left_out = dict[str, dict[int, str]]()
         self.topics: dict[str, str] = {connection.topic: connection.msgtype for connection in reader.connections}
 
     def of_type(self, *types: str) -> list[str]:
@@ -41,28 +53,87 @@ class Bag:
             raise InputError(f"{self.path}: holds several {what} topics, choose one with {option}: {', '.join(topics)}")
         return wanted or topics[0]
 
-    def messages(self, topics: list[str]) -> Iterator[tuple[str, int, Any]]:
-        """(topic, recording time in ns, message) in order of time. InputError where the bag is damaged."""
+    def messages(self, topics: list[str]) -> Iterator[Recorded]:
+        """All messages in order of time but those that are cut, and images without data.
+        InputError where the bag is damaged between messages."""
         chosen = [c for c in self._reader.connections if c.topic in topics]
         if not chosen:
             return
-        with refusing(f"{self.path}: a message on {', '.join(topics)} cannot be read ({{why}}); record the bag again"):
+        counts = dict.fromkeys(topics, 0)
+        with refusing(f"{self.path}: {', '.join(topics)} cannot be read ({{why}}); {_RECOVER}"):
             for connection, time, raw in self._reader.messages(connections=chosen):
-                yield connection.topic, time, self._reader.deserialize(raw, connection.msgtype)
+                topic, number = connection.topic, counts[connection.topic]
+                counts[topic] += 1
+                try:
+                    message = self._reader.deserialize(raw, connection.msgtype)
+                except Exception as error:  # of struct, NumPy or rosbags, by where it is cut
+                    self.leave_out(topic, number, f"cannot be read ({brief(error)})")
+                    continue
+                if connection.msgtype in IMAGES and len(message.data) == 0:
+                    self.leave_out(topic, number, "holds no data")
+                    continue
+                yield Recorded(topic, number, time, message)
+
+    def decoded(
+        self, topic: str, decode: Callable[[Any, str], np.ndarray], numbers: set[int] | None = None
+    ) -> Iterator[tuple[Recorded, np.ndarray]]:
+        """The messages of an image topic (with `numbers` only these) and their images; those that `decode` refuses are
+        left out. InputError if it refuses all."""
+        refused, used = None, False
+        for one in self.messages([topic]):
+            if numbers is None or one.number in numbers:
+                try:
+                    image = decode(one.message, f"{self.path}: {topic}")
+                except InputError as error:
+                    refused = refused or error
+                    self.leave_out(topic, one.number, str(error).removeprefix(f"{self.path}: {topic}: "))
+                    continue
+                used = True
+                yield one, image
+        if refused and not used:
+            raise refused
+
+    def leave_out(self, topic: str, number: int, why: str) -> None:
+        """Notes that a message is not used; InputError if the bag is read strictly."""
+        if self.strict:
+            raise InputError(f"{self.path}: {topic}: message {number}: {why}; without --strict it is left out")
+        self.left_out.setdefault(topic, {})[number] = why
+
+    def lines(self) -> list[str]:
+        """What was left out, a line for each topic."""
+        return [
+            f"{topic}: {len(found)} messages left out, the first number {min(found)}: {found[min(found)]}"
+            for topic, found in self.left_out.items()
+        ]
 
 
-def camera_of(topic: str) -> tuple[str, bool]:
-    """(its camera_info, whether its images are rectified) of an image topic, as ROS's image_pipeline names them:
-    /front/image_rect_color/compressed has /front/camera_info, and is rectified."""
-    for transport in ("/compressed", f"/{DEPTH_TRANSPORT}"):
-        topic = topic.removesuffix(transport)
-    namespace, _, image = topic.rpartition("/")
-    return f"{namespace}/camera_info", "rect" in image.partition("_")[2]
+_RECOVER = "mend it with `mcap recover`, `ros2 bag reindex` or `rosbag reindex`, or record it again"
+_WAL = "-wal"
+"""Ends the name of SQLite's write-ahead log."""
+
+
+def _storage(path: Path) -> list[Path]:
+    """What the reader opens: `path`, or the files of a ROS 2 bag folder whose recorder ended before it described them.
+    InputError for a folder without a bag, or with several, and for SQLite's files that miss what is in their log."""
+    if not path.is_dir():
+        return [path]
+    files = sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))
+    for log in (file.with_name(file.name + _WAL) for file in files):
+        if log.is_file() and log.stat().st_size:
+            found = f"{log}: holds messages that are not in the database yet"
+            raise InputError(f'{found}; merge them: sqlite3 {log.name.removesuffix(_WAL)} "PRAGMA wal_checkpoint"')
+    described = path / METADATA
+    if described.is_file() and read_yaml(described, "the description of a ROS 2 bag"):  # it refuses aliases
+        return [path]
+    if len({re.sub(r"_\d+$", "", file.stem) for file in files}) != 1:  # a bag's files are NAME_0, NAME_1, …
+        found = f"no {METADATA}, and {', '.join(file.name for file in files) or 'neither .mcap nor .db3'}"
+        raise InputError(f"{path}: is no bag: it holds {found}; give one file, or `ros2 bag reindex` it")
+    return files
 
 
 @contextmanager
-def open_bag(path: Path) -> Iterator[Bag]:
-    """Opens a ROS 1 .bag, a ROS 2 bag folder (SQLite or MCAP) or an .mcap file. InputError if it is none of these."""
+def open_bag(path: Path, strict: bool = False) -> Iterator[Bag]:
+    """Opens a ROS 1 .bag, a ROS 2 bag folder, or an .mcap or .db3 file. InputError if it is none of these."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -70,14 +141,12 @@ def open_bag(path: Path) -> Iterator[Bag]:
         raise missing_extra("rosbags", "ros") from error
     if not path.exists():
         raise InputError(f"{path}: no such bag; expected a .bag, an .mcap, or the folder of a ROS 2 bag")
-    if (path / METADATA).is_file():
-        read_yaml(path / METADATA, "the description of a ROS 2 bag")  # the library's reader takes aliases
-    with refusing(f"{path}: is no bag that can be read ({{why}}); expected ROS 1, ROS 2 or MCAP"):
+    with refusing(f"{path}: is no bag that can be read ({{why}}); expected ROS 1, ROS 2 or MCAP; {_RECOVER}"):
         store = None if path.suffix == ".bag" else get_typestore(Stores.LATEST)  # old ROS 2 bags lack definitions
-        reader = AnyReader([path], default_typestore=store)
+        reader = AnyReader(_storage(path), default_typestore=store)
         reader.open()
     try:
-        yield Bag(reader, path)
+        yield Bag(reader, path, strict)
     except (InputError, OSError):  # of writing: what reading raises is an InputError
         raise
     except Exception as error:  # fields of other types or without sense, in what is done with them
@@ -90,6 +159,21 @@ def stamp_of(message: Any) -> int:
     """Header time of a message in ns."""
     stamp = message.header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def first_frame(bag: Bag, topic: str) -> str:
+    """The tf frame of the first message on a topic; "" if there is none."""
+    return next((frame_of(one.message) for one in bag.messages([topic])), "")
+
+
+def frame_of(message: Any) -> str:
+    """The tf frame of a message."""
+    return str(message.header.frame_id).lstrip("/")
+
+
+def kind_of(message: Any) -> str:
+    """The encoding of an Image, or the format of a CompressedImage."""
+    return str(message.encoding if hasattr(message, "encoding") else message.format)
 
 
 # Encoding -> (channels of the message, OpenCV's conversion to BGR or None). Bayer names differ: ROS names the first
@@ -116,10 +200,15 @@ _EIGHT_BIT: dict[str, tuple[int, int | None]] = {
 
 def decode_image(message: Any, where: str) -> np.ndarray:
     """An Image or CompressedImage as [H, W, 3] uint8 BGR. InputError naming `where` if it is not an 8-bit image."""
+    encoding = kind_of(message)
     if not hasattr(message, "encoding"):
-        what = f"compressed image of format '{message.format}' (jpeg, png are)"
-        return read_picture(bytes(message.data), where, what, cv2.IMREAD_COLOR)
-    encoding = str(message.encoding)
+        what = f"compressed image of format '{encoding}' (jpeg, png are)"
+        mosaic = _mosaic(message)  # the camera's pixels as they are: no EXIF rotation
+        flags = cv2.IMREAD_UNCHANGED if mosaic else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        picture = read_picture(bytes(message.data), where, what, flags)
+        if picture.dtype == np.uint16:
+            picture = (picture / 257 + 0.5).astype(np.uint8)
+        return np.asarray(cv2.cvtColor(picture, mosaic)) if mosaic and picture.ndim == 2 else picture[..., :3]
     if encoding not in _EIGHT_BIT:
         known = f"{', '.join(_EIGHT_BIT)} (a depth image? give another --topic)"
         raise InputError(f"{where}: images are encoded as '{encoding}'; expected one of {known}")
@@ -139,9 +228,16 @@ def raw_rows(message: Any, size: int, where: str) -> np.ndarray:
     return np.ascontiguousarray(data[: step * height].reshape(height, step)[:, : width * size])
 
 
+def _mosaic(message: Any) -> int | None:
+    """OpenCV's conversion of the Bayer mosaic that a CompressedImage may hold ("bayer_rggb8; png compressed "), by the
+    encoding before the semicolon; None for others."""
+    encoding = kind_of(message).partition(";")[0].strip().replace("16", "8")
+    return _EIGHT_BIT[encoding][1] if encoding.startswith("bayer") and encoding in _EIGHT_BIT else None
+
+
 def encoded(message: Any, picture: np.ndarray) -> tuple[str, bytes]:
-    """(suffix, bytes) of an image file: a compressed message is written unchanged, others as PNG."""
-    if not hasattr(message, "encoding"):
+    """(suffix, bytes) of an image file: a compressed message is written unchanged, others and mosaics as PNG."""
+    if not hasattr(message, "encoding") and _mosaic(message) is None:
         data = bytes(message.data)
         if data[:2] == b"\xff\xd8":
             return ".jpg", data

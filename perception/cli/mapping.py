@@ -41,7 +41,7 @@ def register(commands: Any) -> None:
     p.add_argument("--model", choices=("auto", "pinhole", "fisheye"), default="auto")
 
     p = command(commands, "frames", _frames, "sharp, well-spaced photos out of a ROS bag, with intrinsics and poses")
-    p.add_argument("bag", type=Path, metavar="BAG", help="ROS 1 .bag, ROS 2 bag folder, or .mcap")
+    p.add_argument("bag", type=Path, metavar="BAG", help="ROS 1 .bag, ROS 2 bag folder, .mcap or .db3")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
     p.add_argument("--topic", help="of the images (default: the bag's only one)")
     p.add_argument("--camera-info", metavar="TOPIC", help="default: beside the images")
@@ -52,6 +52,7 @@ def register(commands: Any) -> None:
     )
     p.add_argument("--max-frames", type=int, default=200, metavar="N")
     p.add_argument("--spacing", type=float, default=0.08, metavar="S", help="least motion, as share of the width")
+    p.add_argument("--strict", action="store_true", help="refuse damaged messages instead of leaving them out")
 
 
 def _add_map(commands: Any) -> None:
@@ -199,5 +200,5 @@ def _calibrate(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 def _frames(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.bags.frames import FrameOptions, run_frames
 
-    names = ("topic", "camera_info", "camera", "fixed_frame", "depth", "max_frames", "spacing")
+    names = ("topic", "camera_info", "camera", "fixed_frame", "depth", "max_frames", "spacing", "strict")
     return run_frames(args.bag, args.output, FrameOptions(**{name: getattr(args, name) for name in names}))

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.cloud import read_cloud
+from perception.io.cloud import read_cloud, to_int32
 from perception.types import PointCloud
 
 OBJECT = 1  # the only class in class-agnostic evaluation
@@ -327,7 +327,7 @@ def read_scores(path: str | Path) -> dict[int, float]:
 def _ids(cloud: PointCloud, path: str | Path) -> Any:
     for name in _ID_NAMES:
         if name in cloud.labels:
-            return cloud.labels[name]
+            return to_int32(cloud.labels[name], f"{path}: property '{name}'")
     found = ", ".join(cloud.labels) or "none"
     raise InputError(f"{path}: has no whole-number property 'instance_id' (found: {found})")
 

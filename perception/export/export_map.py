@@ -24,7 +24,7 @@ from perception.export.spz import write_spz
 from perception.frame.recentre import map_from_input
 from perception.geometry import check_similarity, move_points, scale_of
 from perception.io.atomic import atomic_file
-from perception.io.cloud import read_cloud, write_cloud
+from perception.io.cloud import read_cloud, storable, write_cloud
 from perception.map.write import Map, read_map
 from perception.types import PointCloud
 
@@ -155,6 +155,9 @@ def export_map(
     inside = check_overlap(means, cloud.points)
     if color == "instance":
         cloud = replace(cloud, colors=instance_palette(labels))
+    others = storable(cloud.labels)[1] if output.suffix.lower() != ".npz" else []
+    if others:
+        facts["left_out"] = others
     sidecar = write_export(output, cloud, labels, instances, facts)  # last: where it is, everything was written
     result = {
         "points": len(labels),
@@ -212,6 +215,8 @@ def _table(result: dict[str, Any]) -> str:
         lines.append("aligned: " + ", ".join(f"{key} {value}" for key, value in result["alignment"].items()))
     if result["max_distance"] is not None:
         lines.append(f"points farther than {result['max_distance']:.4g} from every Gaussian are -1")
+    if "left_out" in result:
+        lines.append(f"columns that the format cannot hold are left out: {', '.join(result['left_out'])}")
     if result["inside_map"] < 0.5:
         lines.append(f"only {result['inside_map']:.0%} of the points lie inside the map: same frame and unit?")
     return "\n".join(lines)
@@ -273,7 +278,8 @@ def write_export(
 ) -> dict[str, Any]:
     """Writes the cloud with `instance_id` and its sidecar JSON (same stem); returns the sidecar.
 
-    labels [P] int32, −1 = none; points and order are the cloud's own. instances: {id: {"score", "label"}} of the map.
+    labels [P] int32, −1 = none; points, order and other columns are the cloud's own. instances: {id: {"score",
+    "label"}} of the map.
     Entries have "score", "label", "num_points"; those of parts also their `parent`, of groups the `instances` in them.
     facts: further keys of the sidecar.
     """
@@ -287,5 +293,5 @@ def write_export(
     with atomic_file(path.with_suffix(".json")) as new:
         new.write_text(json.dumps(sidecar, indent=1), encoding="utf-8")
     labelled = {"instance_id": labels.astype(np.int32)}
-    write_cloud(path, PointCloud(cloud.points, cloud.colors, cloud.normals, cloud.faces, labelled))
+    write_cloud(path, replace(cloud, labels=labelled | {n: v for n, v in cloud.labels.items() if n not in labelled}))
     return sidecar

@@ -6,41 +6,51 @@ row as a smaller cloud, and allocates the size that a damaged header gives witho
 
 from __future__ import annotations
 
+import re
+import struct
+from codecs import BOM_UTF8
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from perception.errors import InputError
 from perception.io.arrays import read_npz
 from perception.io.atomic import atomic_file
-from perception.io.ply import MOST_ROWS, Property, Table, packed, read_body, read_ply, write_ply
+from perception.io.ply import MOST_ROWS, Element, Lists, Property, Table, packed, read_body, read_ply, write_ply
 from perception.machine import require_memory
 from perception.types import PointCloud
 
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 _NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
-_NOT_LABELS = {"alpha", "diffuse_alpha", "a", "rgb", "rgba"}
+_WRITTEN = {*"xyz", *_COLORS[0], *_NORMALS[0], *_NORMALS[1], "rgb"}
+"""Names of columns that hold the points, colours and normals of files that are written."""
+_EXACT = 2**53
+"""Whole numbers up to this are exact as doubles."""
+_ASIDE = 0.95
+"""Share of floating-point colours by whose largest their unit is seen: lights may exceed it."""
+_SOME = 1 << 16
+"""Points of which the unit of colours is seen, and faces that are split at a time."""
 _PCD_KINDS = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
-_PCD_COLUMNS = 1 << 12
+_PCD_COLUMNS, _PCD_LINE = 1 << 12, 1 << 14
+_LZF_DENSEST = 88
+"""Most bytes that a byte of LZF's code can stand for: 264 by 3."""
 
 
 def read_cloud(path: str | Path) -> PointCloud:
     """Read .ply (cloud or mesh), .pcd or .npz.
-    points are float64 where the file stores doubles, else float32; integer columns besides the colours become `labels`;
-    faces of more than three corners are split into fans. NaN and infinite points are kept in place."""
+    points are float64 where float32 would lose digits; columns besides points, colours and normals become `labels`;
+    faces of more than three corners are split into fans. NaN and infinite points are kept in place. Memory at its peak
+    is at most three times the size of the file (`python tools speed.readers`)."""
     path = Path(path)
     if path.suffix.lower() not in _FORMATS:
         raise InputError(f"{path}: unknown point cloud format '{path.suffix}'; expected {', '.join(_FORMATS)}")
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; expected a point cloud")
-    require_memory(4 * path.stat().st_size, str(path), "split the cloud, or use a machine with more memory")
+    require_memory(3 * path.stat().st_size, str(path), "split the cloud, or use a machine with more memory")
     cloud = _FORMATS[path.suffix.lower()][0](path)
     if len(cloud.points) == 0:
         raise InputError(f"{path}: holds no points")
-    bad = [] if cloud.faces is None else cloud.faces[(cloud.faces < 0) | (cloud.faces >= len(cloud.points))]
-    if len(bad):
-        raise InputError(f"{path}: a face names vertex {bad[0]}, but there are {len(cloud.points)} vertices")
     return cloud
 
 
@@ -68,42 +78,65 @@ def to_int32(values: np.ndarray, where: str) -> np.ndarray:
 
 
 def to_uint8(colors: np.ndarray) -> np.ndarray:
-    """Colours [P, 3] as uint8: floats in [0, 1] are scaled by 255, 16-bit values by 1/257, bytes are kept."""
-    if colors.dtype == np.uint8:
-        return colors
+    """Colours [P, 3] as uint8: bytes are kept, 16-bit values scaled by 1 / 257. Floats are scaled by 255 where nearly
+    all lie in [0, 1], some above as lights may; else they are values of bytes, or of 16 bits where many exceed 255."""
+    if colors.dtype.itemsize == 1:
+        return colors.view(np.uint8)  # writers also name the type char
     if colors.dtype.kind == "f":
-        clean = np.nan_to_num(colors)
-        scale = 255.0 if clean.max(initial=0) <= 1.0 else 1.0
-        return np.clip(np.round(clean * scale), 0, 255).astype(np.uint8)
+        some = np.nan_to_num(colors[:: -(-len(colors) // _SOME) or 1], posinf=0, neginf=0)
+        level = float(np.quantile(some, _ASIDE)) if some.size else 0.0
+        whole = bool((some == np.round(some)).all()) and some.max(initial=0) > 1
+        scale = 255.0 if level <= 2 and not whole else 1 / 257 if level > 255 else 1.0
+        return np.clip(np.round(np.nan_to_num(colors) * scale), 0, 255).astype(np.uint8)
     wide = colors.max(initial=0) > 255
     return np.clip(np.round(colors / 257.0) if wide else colors, 0, 255).astype(np.uint8)
 
 
-def _cloud_of(columns: dict[str, np.ndarray], path: Path) -> PointCloud:
-    """The cloud of named columns [P] of a file at `path`."""
-    columns = {name: values for name, values in columns.items() if values.ndim == 1 and values.dtype != object}
+def storable(labels: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], list[str]]:
+    """(labels that PLY and PCD hold, each in one of PLY's types; names of the others). Whole numbers of 64 bits become
+    int32 or double, where exact."""
+    kept, others = dict[str, np.ndarray](), list[str]()
+    for name, values in labels.items():
+        kind: Any = values.dtype
+        if kind.kind == "b":
+            kind = np.uint8
+        elif kind.kind == "f":
+            kind = np.promote_types(kind, np.float32)
+        elif kind.itemsize == 8:
+            most = max(-int(values.min(initial=0)), int(values.max(initial=0)))
+            kind = np.int32 if most <= np.iinfo(np.int32).max else np.float64 if most <= _EXACT else None
+        if kind is None or not re.fullmatch("[!-~]+", name) or name in _WRITTEN:
+            others.append(name)
+        else:
+            kept[name] = values.astype(kind)
+    return kept, others
+
+
+def _cloud_of(element: Element, path: Path) -> PointCloud:
+    """The cloud of the named columns [P] of a file at `path`; lists are left out."""
+    columns = {name: values for name, values in element.items() if isinstance(values, np.ndarray) and values.ndim == 1}
     if not set("xyz") <= columns.keys():
         raise InputError(f"{path}: has the fields {', '.join(columns)[:200] or 'none'}; expected x, y and z")
-    points = np.stack([columns[axis] for axis in "xyz"], axis=1)
-    cloud = PointCloud(_floats(points))
+    cloud = PointCloud(_floats(np.stack([columns[axis] for axis in "xyz"], axis=1)))
     colors, normals = (next((n for n in kinds if set(n) <= columns.keys()), None) for kinds in (_COLORS, _NORMALS))
-    packed = next((columns[name] for name in ("rgb", "rgba") if name in columns), None)
+    together = next((n for n in ("rgb", "rgba") if n in columns and columns[n].dtype.itemsize == 4), None)
+    used = {*"xyz", *(colors or (together,)), *(normals or ())}
     if colors is not None:
         cloud.colors = to_uint8(np.stack([columns[name] for name in colors], axis=1))
-    elif packed is not None and packed.dtype == np.uint32:
-        cloud.colors = np.stack([packed >> 16, packed >> 8, packed], axis=1).astype(np.uint8)
+    elif together is not None:
+        bgra = np.ascontiguousarray(columns[together]).view(np.uint8).reshape(-1, 4)  # of 0xAARRGGBB
+        cloud.colors = np.ascontiguousarray(bgra[:, 2::-1])
     if normals is not None:
-        cloud.normals = np.stack([columns[name] for name in normals], axis=1).astype(np.float32)
-    for name, values in columns.items():
-        is_id = values.dtype.kind in "iu" or (values.dtype.kind == "f" and name.endswith(("_id", "label")))
-        if is_id and name not in {*"xyz", *_NOT_LABELS, *(colors or ()), *(normals or ())}:
-            # CloudCompare writes every label as a float named scalar_...
-            cloud.labels[name.removeprefix("scalar_")] = to_int32(values, f"{path}: property '{name}'")
+        cloud.normals = np.stack([columns[name] for name in normals], axis=1).astype(np.float32, copy=False)
+    for name in (name for name in columns if name not in used):
+        short = name.removeprefix("scalar_")  # which CloudCompare puts before every name
+        free = short not in {*columns, *_WRITTEN}
+        cloud.labels[short if free else name] = np.ascontiguousarray(columns[name])
     return cloud
 
 
 def _floats(points: np.ndarray) -> np.ndarray:
-    return points if points.dtype == np.float64 else points.astype(np.float32, copy=False)
+    return points.astype(np.result_type(points.dtype, np.float32), copy=False)
 
 
 def _columns_of(cloud: PointCloud, normals: tuple[str, ...]) -> dict[str, np.ndarray]:
@@ -115,10 +148,11 @@ def _columns_of(cloud: PointCloud, normals: tuple[str, ...]) -> dict[str, np.nda
 
 def _read_ply_cloud(path: Path) -> PointCloud:
     elements = read_ply(path)
-    cloud, face = _cloud_of(elements.get("vertex", {}), path), elements.get("face", {})
+    vertex, face = elements.get("vertex", {}), elements.get("face", {})
+    cloud = _cloud_of(vertex, path)
     for name in ("vertex_indices", "vertex_index"):
         if name in face:
-            cloud.faces = _triangles(face[name], path)
+            cloud.faces = _triangles(face[name], len(cloud.points), path)
     return cloud
 
 
@@ -126,22 +160,44 @@ def _write_ply_cloud(path: Path, cloud: PointCloud) -> None:
     vertex = _columns_of(cloud, _NORMALS[0])
     if cloud.colors is not None:
         vertex |= {name: cloud.colors[:, i].astype(np.uint8) for i, name in enumerate(_COLORS[0])}
-    elements = {"vertex": vertex | {name: values.astype(np.int32) for name, values in cloud.labels.items()}}
+    elements = {"vertex": vertex | storable(cloud.labels)[0]}
     if cloud.faces is not None:
         elements["face"] = {"vertex_indices": cloud.faces.astype(np.int32)}
     write_ply(path, elements)
 
 
-def _triangles(faces: np.ndarray, path: Path) -> np.ndarray:
-    if faces.dtype != object:
-        if faces.ndim != 2:
-            raise InputError(f"{path}: the corners of element 'face' are {faces.dtype}, expected a property list")
-        if len(faces) == 0 or faces.shape[1] < 3:
-            return np.empty((0, 3), np.int32)
-        corners = [faces[:, [0, i, i + 1]] for i in range(1, faces.shape[1] - 1)]
-        return np.stack(corners, axis=1).reshape(-1, 3).astype(np.int32)
-    fans = [(f[0], f[i], f[i + 1]) for f in faces for i in range(1, len(f) - 1)]
-    return np.array(fans, np.int32).reshape(-1, 3)
+def _triangles(faces: np.ndarray | Lists, vertices: int, path: Path) -> np.ndarray:
+    """Triangles [F, 3] int32 of faces with any number of corners, each split into a fan, in order."""
+    values = faces.values if isinstance(faces, Lists) else faces
+    low, high = (values.min(), values.max()) if values.size else (0, -1)
+    if low < 0 or high >= vertices:
+        raise InputError(f"{path}: a face names vertex {low if low < 0 else high}, but there are {vertices} vertices")
+    if isinstance(faces, Lists):
+        return _fans(faces)
+    if faces.ndim != 2:
+        raise InputError(f"{path}: the corners of element 'face' are {faces.dtype}, expected a property list")
+    found = np.empty((len(faces), max(faces.shape[1] - 2, 0), 3), np.int32)
+    for i in range(found.shape[1]):
+        found[:, i, 0], found[:, i, 1], found[:, i, 2] = faces[:, 0], faces[:, i + 1], faces[:, i + 2]
+    return found.reshape(-1, 3)
+
+
+def _fans(faces: Lists) -> np.ndarray:
+    """`_triangles` of faces of different numbers of corners."""
+    found, at, corner = (
+        np.empty((int(np.maximum(faces.counts, 2).sum(dtype=np.int64)) - 2 * len(faces), 3), np.int32),
+        0,
+        0,
+    )
+    for begin in range(0, len(faces), _SOME):
+        counts = faces.counts[begin : begin + _SOME].astype(np.int64)
+        n = np.maximum(counts - 2, 0)
+        first = np.repeat(corner + np.cumsum(counts) - counts, n)
+        step = np.arange(len(first)) - np.repeat(np.cumsum(n) - n, n) + 1
+        part = found[at : at + len(first)]
+        part[:, 0], part[:, 1], part[:, 2] = (faces.values[i] for i in (first, first + step, first + step + 1))
+        at, corner = at + len(first), corner + int(counts.sum())
+    return found
 
 
 def _read_npz(path: Path) -> PointCloud:
@@ -157,9 +213,9 @@ def _read_npz(path: Path) -> PointCloud:
         elif name == "normals" and values.shape == points.shape:
             cloud.normals = values.astype(np.float32, copy=False)
         elif name == "faces" and values.ndim == 2 and values.shape[1] == 3:
-            cloud.faces = values.astype(np.int32, copy=False)
-        elif values.shape == (len(points),) and values.dtype.kind in "iu":
-            cloud.labels[name] = to_int32(values, f"{path}: array '{name}'")
+            cloud.faces = _triangles(values, len(points), path)
+        elif values.shape == (len(points),) and values.dtype.kind in "iufb":
+            cloud.labels[name] = values.astype(values.dtype.newbyteorder("="), copy=False)
     return cloud
 
 
@@ -173,36 +229,35 @@ def _write_npz(path: Path, cloud: PointCloud) -> None:
 
 def _read_pcd(path: Path) -> PointCloud:
     """The cloud of the fields of COUNT 1; rgb(a) is packed in 4 bytes. Fields named "_" are padding."""
-    data, at, header = path.read_bytes(), 0, dict[str, list[str]]()
-    while "DATA" not in header:
-        end = data.find(b"\n", at)
-        if end < 0 or at > 1 << 16:
-            raise InputError(f"{path}: PCD header has no DATA line")
-        name, *values = data[at:end].decode("ascii", "replace").split() or ["#"]
-        at = end + 1
-        header[name.upper()] = values
-    kind = " ".join(header["DATA"]).lower()
-    if kind not in ("ascii", "binary"):
-        raise InputError(f"{path}: PCD DATA is '{kind}'; expected ascii or binary (pcl_convert_pcd_ascii_binary)")
-    try:
-        table = _pcd_table(header)
-    except (KeyError, IndexError, ValueError) as error:
-        raise InputError(f"{path}: PCD header cannot be understood ({error})") from error
-    columns = read_body(path, data[at:], "<" if kind == "binary" else "", [table])[table.name]
-    columns = {name: values for name, values in columns.items() if not name.startswith("_")}
-    for name in {"rgb", "rgba"} & columns.keys():
-        if columns[name].dtype.itemsize == 4:
-            columns[name] = columns[name].view(np.uint32)
-    return _cloud_of(columns, path)
+    header = dict[str, list[str]]()
+    with path.open("rb") as file:
+        while "DATA" not in header:
+            line = file.readline(_PCD_LINE)
+            if not line or file.tell() > 1 << 16:
+                raise InputError(f"{path}: PCD header has no DATA line")
+            name, *values = line.removeprefix(BOM_UTF8).decode("ascii", "replace").split() or ["#"]
+            header[name.upper()] = values
+        kind, left = " ".join(header["DATA"]).lower(), path.stat().st_size - file.tell()
+        if kind not in ("ascii", "binary", "binary_compressed"):
+            raise InputError(f"{path}: PCD DATA is '{kind}'; expected ascii, binary or binary_compressed")
+        try:
+            table = _pcd_table(header, left if kind == "binary" else None)
+            if kind == "binary_compressed":
+                columns = _by_column(_unpacked(file, path), table)
+        except (KeyError, IndexError, ValueError, struct.error) as error:
+            raise InputError(f"{path}: PCD cannot be understood ({error})") from error
+        if kind != "binary_compressed":
+            columns = read_body(path, file, "<" if kind == "binary" else "", [table])[table.name]
+    return _cloud_of({name: values for name, values in columns.items() if not name.startswith("_")}, path)
 
 
-def _pcd_table(header: dict[str, list[str]]) -> Table:
-    """The columns of a PCD; "_" begins the names of those that are not read: padding, repeated names, vectors."""
+def _pcd_table(header: dict[str, list[str]], held: int | None) -> Table:
+    """The columns of a PCD; "_" begins the names of those that are not read: padding, repeated names, vectors.
+    held: bytes of the rows, which decide where two numbers of points are given."""
     names, sizes, types = header["FIELDS"], header["SIZE"], header["TYPE"]
     counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
-    rows = int((header.get("POINTS") or header["WIDTH"])[0])
-    if not 0 <= rows <= MOST_ROWS or min(counts) < 1 or sum(counts) > _PCD_COLUMNS:
-        raise ValueError(f"{rows} points of {sum(counts)} numbers")
+    if min(counts) < 0 or sum(counts) > _PCD_COLUMNS:
+        raise ValueError(f"points of {sum(counts)} numbers")
     columns: list[Property] = []
     for i, (name, size, letter, count) in enumerate(zip(names, sizes, types, counts, strict=True)):
         if (kind := f"{letter.lower()}{size}") not in _PCD_KINDS:
@@ -211,7 +266,52 @@ def _pcd_table(header: dict[str, list[str]]) -> Table:
             columns.append(Property(name, kind))
         else:
             columns += [Property(f"_{i}_{number}", kind) for number in range(count)]
-    return Table("points", rows, columns)
+    rows = {int(header["POINTS"][0])} if "POINTS" in header else set()
+    if "WIDTH" in header:
+        rows.add(int(header["WIDTH"][0]) * int(header.get("HEIGHT", ["1"])[0]))
+    if len(rows) > 1 and held is not None:
+        rows = {n for n in rows if n * sum(int(p.kind[1:]) for p in columns) == held} or rows
+    if len(rows) != 1 or not 0 <= min(rows) <= MOST_ROWS:
+        raise ValueError(f"POINTS and WIDTH × HEIGHT are {' and '.join(map(str, sorted(rows))) or 'not given'}")
+    return Table("points", rows.pop(), columns)
+
+
+def _by_column(data: bytes, table: Table) -> Element:
+    """The columns of a table that stores one after another."""
+    columns, at = Element(), 0
+    for p in table.properties:
+        columns[p.name] = values = np.frombuffer(data, f"<{p.kind}", table.rows, at)
+        at += values.nbytes
+    return columns
+
+
+def _unpacked(file: BinaryIO, path: Path) -> bytes:
+    """The bytes of binary_compressed: two lengths, packed and unpacked, and LibLZF's code. A byte c < 32 begins c + 1
+    bytes as they are; else they repeat (c >> 5) + 2 bytes (7: and the next byte's) from at most 8192 bytes before."""
+    data = memoryview(file.read())
+    packed, size = struct.unpack_from("<II", data)
+    code, out, at = data[8 : 8 + packed], bytearray(), 0
+    if len(code) < packed or size > _LZF_DENSEST * packed:
+        raise ValueError(f"{len(code)} of {packed} packed bytes are there, for {size}")
+    require_memory(2 * size, str(path), "use a machine with more memory")
+    while at < packed:
+        control, at = code[at], at + 1
+        if control < 32:
+            out += code[at : at + control + 1]
+            at += control + 1
+            continue
+        length = (control >> 5) + 2
+        if length == 9:
+            length, at = length + code[at], at + 1
+        before = ((control & 31) << 8) + code[at] + 1
+        at += 1
+        if before > len(out) or len(out) > size:
+            raise ValueError("the packed bytes are damaged")
+        piece = out[-before : length - before or None] if length < before else out[-before:]
+        out += piece if length <= before else (piece * (length // before + 1))[:length]
+    if len(out) != size:
+        raise ValueError(f"{len(out)} bytes are unpacked, expected {size}")
+    return bytes(out)
 
 
 def _write_pcd(path: Path, cloud: PointCloud) -> None:
@@ -220,7 +320,7 @@ def _write_pcd(path: Path, cloud: PointCloud) -> None:
     if cloud.colors is not None:
         r, g, b = cloud.colors.astype(np.uint32).T
         columns["rgb"] = ((r << 16) | (g << 8) | b).view(np.float32)
-    columns |= {name: values.astype(np.int32) for name, values in cloud.labels.items()}
+    columns |= storable(cloud.labels)[0]
     rows = packed(columns)
     kinds = [rows.dtype[name] for name in columns]
     header = (

@@ -10,11 +10,16 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.atomic import atomic_file
 from perception.io.documents import brief, read_yaml
-from perception.photos.lens import MOST_SIDE, opencv_lens
+from perception.photos.lens import FISHEYE, MOST_SIDE, PERSPECTIVE, opencv_lens
 from perception.types import Lens
 
-_COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
-"""Numbers of coefficients by distortion model."""
+_NAMES: dict[str, tuple[str, ...]]
+_NAMES = dict.fromkeys(("plumb_bob", "rational_polynomial", "radtan", "brown_conrady"), PERSPECTIVE)
+_NAMES |= dict.fromkeys(("equidistant", "fisheye", "kannala_brandt4"), FISHEYE)
+_NAMES |= dict.fromkeys(("none", "inverse_brown_conrady", "modified_brown_conrady"), ())
+"""The coefficients of distortion models of ROS, Kalibr and librealsense that may differ from zero."""
+_COUNTS = (0, 4, 5, 8, 12, 14)
+"""Numbers of coefficients that OpenCV reads; a driver may write zeros behind those of its model."""
 
 
 def read_camera(path: Path) -> Lens:
@@ -23,7 +28,7 @@ def read_camera(path: Path) -> Lens:
 
 
 def lens_of(data: Any, where: object) -> Lens:
-    """The lens of a camera_info; distortion models plumb_bob, rational_polynomial, equidistant.
+    """The lens of a camera_info; distortion models: see _NAMES; without a name plumb_bob.
     The centre of the first pixel is (0, 0) in ROS and OpenCV and (0.5, 0.5) in COLMAP and this project, so 0.5 is added
     to the principal point. InputError that names `where` for values that are missing or describe no camera."""
     if not isinstance(data, dict):
@@ -34,30 +39,39 @@ def lens_of(data: Any, where: object) -> Lens:
     if min(width, height) < 1 or max(width, height) > MOST_SIDE or min(fx, fy) <= 0:
         sides = f"{width:.6g}×{height:.6g}, {fx:g}, {fy:g}"
         raise InputError(f"{where}: image sides must be 1 to {MOST_SIDE} pixels, focal lengths positive; found {sides}")
-    name = data.get("distortion_model", "plumb_bob")
-    if not isinstance(name, str) or name not in _COUNTS:
-        raise InputError(f"{where}: distortion_model {brief(name)} is not known; expected one of {', '.join(_COUNTS)}")
+    name = data.get("distortion_model") or "plumb_bob"
+    names = _NAMES.get(name.lower().replace(" ", "_")) if isinstance(name, str) else None
+    if names is None:
+        raise InputError(f"{where}: distortion_model {brief(name)} is not known; expected one of {', '.join(_NAMES)}")
     values = _data(data, "distortion_coefficients")
-    found = len(values) if isinstance(values, (list, tuple)) else 0
-    if found not in _COUNTS[name]:
-        expected = " or ".join(map(str, _COUNTS[name]))
-        raise InputError(f"{where}: {name} has {expected} distortion_coefficients, found {found}")
+    found = len(values) if isinstance(values, (list, tuple)) else -1
+    if found not in _COUNTS:
+        expected = ", ".join(map(str, _COUNTS))
+        raise InputError(f"{where}: expected {expected} distortion_coefficients, found {max(found, 0)}")
     k = _numbers(values, found, where, "distortion_coefficients.data").tolist()
-    return opencv_lens((float(fx), float(fy), float(cx), float(cy)), k, width, height, name == "equidistant")
+    if any(k[len(names) :]):
+        known = f"the first {len(names)} coefficients of {name} may differ from 0"
+        raise InputError(f"{where}: {known}, found {k}; undistort the photos, or calibrate with another model")
+    k = [*k, *[0.0] * len(names)][: len(names)]
+    return opencv_lens((float(fx), float(fy), float(cx), float(cy)), k, width, height, names == FISHEYE)
 
 
 def camera_info(message: Any, rectified: bool = False) -> dict[str, Any]:
-    """The camera_info of a ROS CameraInfo message (ROS 1 or 2); rectified: by its projection matrix P."""
+    """The camera_info of a ROS CameraInfo message (ROS 1 or 2). rectified: by its projection matrix P, or by K where P
+    is not set and there is no distortion; InputError where there is."""
 
     def field(name: str) -> list[float]:
         values = getattr(message, name.lower(), None)
         return [float(v) for v in (getattr(message, name.upper()) if values is None else values)]
 
     size, kind = (int(message.width), int(message.height)), str(message.distortion_model) or "plumb_bob"
-    if rectified:
-        P = field("p")
+    P, distortion = field("p"), field("d")
+    unset = len(P) < 12 or not np.isfinite(P).all() or min(P[0], P[5]) <= 0
+    if rectified and unset and any(distortion):
+        raise InputError("the camera_info of rectified images has distortion, and no projection matrix P")
+    if rectified and not unset:
         return camera_data("camera", size, "plumb_bob", [*P[0:3], *P[4:7], *P[8:11]], [0.0] * 5)
-    return camera_data("camera", size, kind, field("k"), field("d") or [0.0] * 5)
+    return camera_data("camera", size, kind, field("k"), distortion)
 
 
 def camera_data(name: str, size: tuple[int, int], kind: str, K: list[float], distortion: list[float]) -> dict[str, Any]:

@@ -284,7 +284,12 @@ def read_picture(source: Path | bytes, where: object, what: str, flags: int = cv
         if isinstance(source, Path) and not source.is_file():
             raise ValueError("no file")
         data = source.read_bytes() if isinstance(source, Path) else source
-        check_size(where, *_claims(data), len(data))
+        size, kind = _claims(data)
+        check_size(where, size, kind, len(data))
+        if kind in _REDUCED:  # OpenCV fills what a JPEG that is cut short lacks with grey
+            with _open(io.BytesIO(data)) as image:
+                image.draft("RGB", reduced_size(*size, 8))
+                image.load()
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
         if picture is None:
             raise ValueError("OpenCV does not read it")

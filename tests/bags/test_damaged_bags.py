@@ -68,8 +68,8 @@ class Broken:
 
 def test_whatever_a_library_raises_between_messages(tmp_path: Path) -> None:
     messages = Bag(Broken(), tmp_path / "a.bag").messages(["/a"])
-    assert next(messages) == ("/a", 1, b"")
-    with pytest.raises(InputError, match=r"a\.bag: a message on /a cannot be read \(lzma: this is no stream\)"):
+    assert next(messages) == ("/a", 0, 1, b"")
+    with pytest.raises(InputError, match=r"a\.bag: /a cannot be read \(lzma: this is no stream\); mend it with"):
         next(messages)
 
 

@@ -31,3 +31,28 @@ def test_all_that_was_asked_for_is_written(tmp_path: Path) -> None:
     assert {p.name for p in folder.iterdir()} == {"out.ply", "out.json"}
     with pytest.raises(InputError, match=r"expected one of \.ply"):
         export_map(path, folder / "m.rrd", None, ExportOptions())
+
+
+@pytest.mark.parametrize("suffix", ["ply", "pcd", "npz"])
+@pytest.mark.parametrize("smooth", [True, False])
+def test_order_number_and_columns_of_a_scan_are_kept(suffix: str, smooth: bool, tmp_path: Path) -> None:
+    """Points that are not finite get no instance; a column that the format cannot hold exactly is named."""
+    gmap = small_map(60)
+    write_map(tmp_path / "m.gsmap", gmap)
+    order = np.random.default_rng(0).permutation(60)
+    points = gmap.means[order].astype(np.float32)
+    points[7], points[30, 2] = np.nan, np.inf
+    whole, halves = np.arange(60, dtype=np.uint32) + 4_000_000_000, np.arange(60, dtype=np.float32) / 2
+    halves[::7] = np.nan
+    stamps = np.arange(60) + 1_700_000_000_000_000_000
+    columns = {"gps_time": whole, "scan_label": halves, "stamp": stamps, "instance_id": np.full(60, 99, np.int32)}
+    np.savez(tmp_path / "scan.npz", points=points, **columns)
+    output = tmp_path / f"out.{suffix}"
+    facts, table = export_map(tmp_path / "m.gsmap", output, tmp_path / "scan.npz", ExportOptions(smooth=smooth))
+    back = read_cloud(output)
+    np.testing.assert_array_equal(back.points, points)
+    np.testing.assert_array_equal(back.labels["gps_time"], whole)
+    np.testing.assert_array_equal(back.labels["scan_label"], halves)
+    assert facts["points"] == 60 and back.labels["instance_id"][[7, 30]].tolist() == [-1, -1]
+    assert (back.labels["instance_id"] >= 0).any() and 99 not in back.labels["instance_id"]
+    assert ("stamp" in back.labels) == (suffix == "npz") == ("left_out" not in facts) == ("stamp" not in table)

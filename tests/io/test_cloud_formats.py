@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from perception.errors import InputError
-from perception.io.cloud import read_cloud, write_cloud
+from perception.evaluate.instances import run_instances
+from perception.io.cloud import read_cloud, to_int32, write_cloud
 from perception.io.ply import read_ply, write_ply
 from perception.types import PointCloud
 
@@ -99,14 +100,14 @@ def test_ascii_ply_equals_binary(tmp_path):
     np.testing.assert_array_equal(a.labels["id"], b.labels["id"])
 
 
-def test_labels_stored_as_floats_are_whole_numbers_or_an_error(tmp_path):
+def test_labels_stored_as_floats_are_whole_numbers_or_an_error_where_they_are_used(tmp_path):
     vertex = {a: np.zeros(3) for a in "xyz"} | {"scalar_instance_id": np.float32([4, -1, 70000])}
     write_ply(tmp_path / "a.ply", {"vertex": vertex})
-    assert read_cloud(tmp_path / "a.ply").labels["instance_id"].tolist() == [4, -1, 70000]
+    assert to_int32(read_cloud(tmp_path / "a.ply").labels["instance_id"], "x").tolist() == [4, -1, 70000]
     vertex["scalar_instance_id"] = np.float32([4, 0.5, 1])
-    write_ply(tmp_path / "a.ply", {"vertex": vertex})
-    with pytest.raises(InputError, match=r"value 0\.5 at index 1"):
-        read_cloud(tmp_path / "a.ply")
+    write_ply(tmp_path / "b.ply", {"vertex": vertex})
+    with pytest.raises(InputError, match=r"b\.ply: property 'instance_id': value 0\.5 at index 1"):
+        run_instances(tmp_path / "b.ply", tmp_path / "a.ply")
 
 
 def test_nan_and_infinite_points_stay_in_place(tmp_path):
@@ -165,7 +166,14 @@ GOOD = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty flo
         ("a.pcd", pcd("x y z", "4 4 4", "F F F", 3, "binary") + b"123", "cut short"),
         ("a.pcd", pcd("x y z", "4 4 4", "F F F", 3, "zipped"), "zipped"),
         ("a.pcd", pcd("x y z", "4 4", "F F F", 3, "ascii"), "cannot be understood"),
-        ("a.pcd", pcd("x y z", "4 4 4", "F F F", 1, "binary_compressed"), "pcl_convert"),
+        ("a.pcd", pcd("x y z", "4 4 4", "F F F", 1, "binary_compressed"), "cannot be understood"),
+        ("a.pcd", pcd("x y z", "4 4 4", "F F F", 1, "binary_compressed") + b"\2\0\0\0\x0c\0\0\0\x20\0", "damaged"),
+        ("a.pcd", pcd("x y z", "4 4 4", "F F F", 1, "binary_compressed") + b"\2\0\0\0\xff\0\0\0\0\0", "packed bytes"),
+        (
+            "a.pcd",
+            pcd("x y z", "4 4 4", "F F F", 2, "ascii").replace(b"POINTS 2", b"POINTS 3") + b"1 2 3 " * 3,
+            "2 and 3",
+        ),
         ("a.npz", b"nonsense", "NPZ"),
         ("a.stl", b"", "unknown point cloud format"),
     ],

@@ -154,6 +154,8 @@ _PCD = (
     b"# .PCD v0.7\nVERSION 0.7\nFIELDS x y z rgb label normal_x normal_y normal_z\nSIZE 4 4 4 4 4 4 4 4\n"
     b"TYPE F F F U I F F F\nCOUNT 1 1 1 1 1 1 1 1\nWIDTH 2\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 2\n"
 )
+_PACKED = bytes([7, 0, 0, 0, 64, 0, 0, 0, 0, 0, 0xE0, 53, 0, 0, 0])
+"""64 zeros by LibLZF: one as it is, 62 that repeat it, and another."""
 
 
 def _cloud() -> Target:
@@ -172,6 +174,7 @@ def _cloud() -> Target:
         ("a.ply", same, _RAGGED),
         ("a.pcd", same, _PCD + b"DATA ascii\n0 1 2 255 4 5 6 7\nnan 1 2 3 4 5 6 7\n"),
         ("a.pcd", same, _PCD + b"DATA binary\n" + bytes(64)),
+        ("a.pcd", same, _PCD + b"DATA binary_compressed\n" + _PACKED),
         ("a.npz", same, archive_of({f"{k}.npy": npy(v) for k, v in arrays.items()})),
         *(("a.npz", member(name, arrays), npy(value)) for name, value in arrays.items()),
     ]
@@ -182,7 +185,7 @@ def _cloud() -> Target:
         assert cloud.colors is None or (cloud.colors.dtype == np.uint8 and cloud.colors.shape == cloud.points.shape)
         assert cloud.normals is None or cloud.normals.shape == cloud.points.shape
         assert cloud.faces is None or (cloud.faces.ndim == 2 and cloud.faces.shape[1] == 3)
-        assert all(v.shape == (len(cloud.points),) and v.dtype == np.int32 for v in cloud.labels.values())
+        assert all(v.shape == (len(cloud.points),) and v.dtype.kind in "iufb" for v in cloud.labels.values())
 
     words = ["element", "property", "list", "vertex", "face", "double", "uchar", "int", "ascii", "binary_big_endian"]
     words += ["COUNT", "POINTS", "WIDTH", "DATA", "binary", "FIELDS", "4294967295", "-1", "nan", "1e400"]
