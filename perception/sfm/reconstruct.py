@@ -20,6 +20,8 @@ from perception.photos.ignore_masks import mask_of
 from perception.photos.lens import lens_from_camera, lens_text, load_pycolmap
 from perception.sfm.consistency import model_warnings
 from perception.sfm.database import FeatureStore, build_features, verified_matches
+from perception.sfm.escalation import Candidate, Escalation
+from perception.sfm.features import camera_groups
 from perception.sfm.incremental import REPEATABLE_PHOTOS, map_photos
 from perception.sfm.model import cloud_of, views_of_model
 from perception.sfm.options import ReadOptions
@@ -72,21 +74,25 @@ def _map(store: FeatureStore, chosen: PhotoSet, folder: Path, options: ReadOptio
     if not done.is_dir():
         started, count = time.perf_counter(), len(chosen.photos)
         found = map_submodels(store, fixed, options) if count > REPEATABLE_PHOTOS else None
-        models, contradicted = found or map_photos(store, fixed, options.seed, count, options.progress)
-        if not models:
+        found = found or map_photos(store, fixed, options.seed, count, options.progress)
+        seconds = {**store.facts["seconds"], "mapping": time.perf_counter() - started}
+        best, steps = Candidate(*found, store), list[dict[str, Any]]()
+        if len(best.registered) < count:
+            groups = camera_groups(store.image_root, chosen.photos, store.names, [options.lens] * count)
+            best, steps = Escalation(best, groups, fixed, options).run()
+        if not best.models:
             advice = "take sharp, overlapping photos of a textured scene from different positions"
             raise InputError(f"{folder}: none of the {count} photos could be registered; {advice}")
-        seconds = {**store.facts["seconds"], "mapping": time.perf_counter() - started}
-        report = _report(models, contradicted, store, chosen.names, seconds)
+        seconds |= {step["step"]: step["seconds"] for step in steps[1:]}
+        report = {**_report(best, chosen.names, seconds), "steps": steps}
         with atomic_directory(done) as new:
-            models[0].write(new)
+            best.models[0].write(new)
             (new / "report.json").write_text(json.dumps(report))
     return load_pycolmap().Reconstruction(done), json.loads((done / "report.json").read_text())
 
 
-def _report(
-    models: list[Any], contradicted: set[str], store: FeatureStore, shown: list[str], seconds: dict[str, float]
-) -> dict[str, Any]:
+def _report(found: Candidate, shown: list[str], seconds: dict[str, float]) -> dict[str, Any]:
+    models, contradicted, store = found.models, found.contradicted, found.store
     best, matches = models[0], _best_partners(store)
     inside = [{model.images[i].name for i in model.reg_image_ids()} for model in models]
     outside = [(name, photo) for name, photo in zip(store.names, shown, strict=True) if name not in inside[0]]
