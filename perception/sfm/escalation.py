@@ -32,8 +32,12 @@ from perception.sfm.incremental import (
 from perception.sfm.options import ReadOptions
 from perception.sfm.pairs import largest_features, similar_photos
 
+MORE = "more"
+"""Folder in that of the features at once."""
 ALL_PAIRS = 150
 """Of up to so many photos, those left out are matched with all others; of more, with the most similar."""
+DOUBT = 4
+"""Photos are not added if over 1/DOUBT of the matched pairs between them and the others contradict their poses."""
 CANDIDATES = 4
 """Models mapped anew of which the best is used; two from all pairs, two from the stronger ones."""
 GUIDED = 8
@@ -77,6 +81,8 @@ class Escalation:
     more: FeatureStore | None = None
     known: list[Any] = field(default_factory=list)
     support: int = 0
+    trusted: bool = False
+    """Whether the matches of `more` contradict no photo of the models at once."""
 
     def run(self) -> tuple[Candidate, list[dict[str, Any]]]:
         """The best candidate; of each step its name, the photos registered after it, and seconds."""
@@ -102,7 +108,13 @@ class Escalation:
         more = len(found.registered) - len(self.best.registered)
         if found.folded or self.best.folded:
             return more >= 0 and not found.folded
-        return more > 0 and found.support >= self.support
+        return more > 0 and found.support >= self.support and not (self.trusted and self._doubtful(found))
+
+    def _doubtful(self, found: Candidate) -> bool:
+        """Whether many pairs of a photo of the best and one that is new contradict the model."""
+        pairs = verified_pairs(found.models[0], found.store.database)
+        across = [pair.agrees for pair in pairs if len({pair.i, pair.j} & self.best.registered) == 1]
+        return across.count(False) * DOUBT > len(across)
 
     def _linked(self, store: FeatureStore) -> dict[tuple[int, int], int]:
         """Verified matches of the pairs of photos, by image ids, of which one or both are not registered."""
@@ -117,6 +129,7 @@ class Escalation:
             return None
         start = self._adjusted(self.best.models[:1], store)
         self.support = Candidate([start], set(), store).support
+        self.trusted = consistent_photos(verified_pairs(start, store.database)) == self.best.registered
         grown = [self._grown(start, store)]
         grown += [self._grown(self._adjusted([model], store), store) for model in self.best.models[1:]]
         return max(grown, key=lambda each: len(each.registered))
@@ -174,14 +187,15 @@ class Escalation:
         options = pipeline_options(self.fixed, self.options.seed, few, store.effort)
         return merge.adjusted(merge.merged(models), store, options, add=False)
 
-    def _grown(self, start: Any, store: FeatureStore) -> Candidate:
+    def _grown(self, start: Any, store: FeatureStore, again: bool = True) -> Candidate:
         """`start` with photos added."""
         seed, count, progress = self.options.seed, len(store.names), self.options.progress
-        return self._checked(*map_photos(store, self.fixed, seed, count, progress, start=start), store)
+        return self._checked(*map_photos(store, self.fixed, seed, count, progress, start=start), store, again)
 
-    def _checked(self, models: list[Any], contradicted: set[str], store: FeatureStore) -> Candidate:
-        """Without the photos that the matches of others contradict; adjusted anew where there are such."""
-        best = models[0]
+    def _checked(self, models: list[Any], contradicted: set[str], store: FeatureStore, again: bool = True) -> Candidate:
+        """Without the photos that the matches of others contradict; where there are such, the others are adjusted anew.
+        again: then photos are added once more, as the wrong ones may have been in the way."""
+        best, complete = models[0], models[0].num_reg_images()
         while out := set(best.reg_image_ids()) - consistent_photos(verified_pairs(best, store.database)):
             contradicted = contradicted | {best.images[image].name for image in out}
             take_out(best, out)
@@ -189,7 +203,15 @@ class Escalation:
                 return Candidate([], contradicted, store)
             best = self._adjusted([best], store)
         self.known += [best, *models[1:]]
-        return Candidate([best, *models[1:]], contradicted, store)
+        had, largest = set(best.reg_image_ids()), best.num_reg_images()
+        new = {
+            model: len(set(model.reg_image_ids()) - had) for model in models[1:] if model.num_reg_images() <= largest
+        }
+        kept = Candidate([best, *(each for each in new if new[each] >= MIN_MODEL_SIZE)], contradicted, store)
+        if not again or largest == complete:
+            return kept
+        grown = self._grown(self._adjusted([best], store), store, again=False)
+        return grown if grown.registered > kept.registered and grown.support > kept.support else kept
 
     # --------------------------------------------------------------- features
 
@@ -197,7 +219,7 @@ class Escalation:
         """THOROUGH features of the photos left out and of those similar to them; those left out are matched with all
         others, and every verified pair of photos with new features again."""
         store, progress = self.best.store, self.options.progress
-        names, folder = store.names, store.folder / "more"
+        names, folder = store.names, store.folder / MORE
         recover(folder)
         if not folder.is_dir():
             with load_pycolmap().Database.open(store.database) as db:

@@ -169,6 +169,18 @@ class _Mapping:
         return sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
 
+def write_models(models: list[Any], folder: Path) -> None:
+    """Writes models into folders of their own in `folder`, which `read_models` reads in the same order."""
+    for number, model in enumerate(models):
+        (folder / f"{number:04}").mkdir()
+        model.write(folder / f"{number:04}")
+
+
+def read_models(folder: Path) -> list[Any]:
+    """The models that `write_models` has written."""
+    return [load_pycolmap().Reconstruction(each) for each in sorted(folder.iterdir()) if each.is_dir()]
+
+
 def take_out(model: Any, images: set[int]) -> None:
     """Takes photos out of a model."""
     for image in sorted(images):
