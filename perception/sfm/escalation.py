@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from perception.geometry import align_similarity
 from perception.io.atomic import atomic_directory, recover
 from perception.photos.lens import load_pycolmap
 from perception.sfm import merge
@@ -38,6 +39,8 @@ ALL_PAIRS = 150
 """Of up to so many photos, those left out are matched with all others; of more, with the most similar."""
 DOUBT = 4
 """Photos are not added if over 1/DOUBT of the matched pairs between them and the others contradict their poses."""
+MOVED = 0.05
+"""Nor if this moves the photos registered before, in the median and relative to their mean distance from the centre."""
 CANDIDATES = 4
 """Models mapped anew of which the best is used; two from all pairs, two from the stronger ones."""
 GUIDED = 8
@@ -111,7 +114,15 @@ class Escalation:
         return more > 0 and found.support >= self.support and not (self.trusted and self._doubtful(found))
 
     def _doubtful(self, found: Candidate) -> bool:
-        """Whether many pairs of a photo of the best and one that is new contradict the model."""
+        """Whether photos of the best lie elsewhere, or many pairs of one of them and a new one contradict the model."""
+        both = sorted(self.best.registered & found.registered)
+        if len(both) < MIN_MODEL_SIZE:
+            return True
+        had, now = (np.stack([c.models[0].images[i].projection_center() for i in both]) for c in (self.best, found))
+        scale, turn, shift = align_similarity(had, now)
+        moved = np.linalg.norm(scale * now @ turn.T + shift - had, axis=1)
+        if np.median(moved) > MOVED * np.linalg.norm(had - had.mean(axis=0), axis=1).mean():
+            return True
         pairs = verified_pairs(found.models[0], found.store.database)
         across = [pair.agrees for pair in pairs if len({pair.i, pair.j} & self.best.registered) == 1]
         return across.count(False) * DOUBT > len(across)
