@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
 from tempfile import TemporaryDirectory
@@ -41,6 +42,8 @@ DOUBT = 4
 """Photos are not added if over 1/DOUBT of the matched pairs between them and the others contradict their poses."""
 MOVED = 0.05
 """Nor if this moves the photos registered before, in the median and relative to their mean distance from the centre."""
+SHARED = 20
+"""Least number of points that a photo shares with two others or more: those of two photos leave a chain's scale open."""
 CANDIDATES = 4
 """Models mapped anew of which the best is used; two from all pairs, two from the stronger ones."""
 GUIDED = 8
@@ -204,10 +207,10 @@ class Escalation:
         return self._checked(*map_photos(store, self.fixed, seed, count, progress, start=start), store, again)
 
     def _checked(self, models: list[Any], contradicted: set[str], store: FeatureStore, again: bool = True) -> Candidate:
-        """Without the photos that the matches of others contradict; where there are such, the others are adjusted anew.
+        """Without photos that matches contradict or few others hold; where there are such, the rest is adjusted anew.
         again: then photos are added once more, as the wrong ones may have been in the way."""
         best, complete = models[0], models[0].num_reg_images()
-        while out := set(best.reg_image_ids()) - consistent_photos(verified_pairs(best, store.database)):
+        while out := _unsure(best, store):
             contradicted = contradicted | {best.images[image].name for image in out}
             take_out(best, out)
             if best.num_reg_images() < MIN_MODEL_SIZE:
@@ -255,3 +258,11 @@ class Escalation:
                 match(database, [(names[i], names[j]) for i, j in chosen], self.options.seed, progress, THOROUGH)
         facts = {**store.facts, "pairs_matched": len(verified_matches(folder / store.database.name))}
         return FeatureStore(folder, store.image_root, names, facts, THOROUGH)
+
+
+def _unsure(model: Any, store: FeatureStore) -> set[int]:
+    """Photos of a model that its matches contradict, or that share less than SHARED points with two others or more."""
+    images = set(model.reg_image_ids())
+    tracks = [point.track.elements for point in model.points3D.values() if point.track.length() > 2]
+    shared = Counter(element.image_id for track in tracks for element in track)
+    return images - consistent_photos(verified_pairs(model, store.database)) | {i for i in images if shared[i] < SHARED}

@@ -130,7 +130,7 @@ def test_photos_that_a_repeated_thing_puts_elsewhere_are_not_added_there(
         return (share if i not in LATE and j in LATE else 1.0) * (j - i < 5)
 
     room = Room()
-    first, best, steps, _ = escalated(room, tmp_path, monkeypatch, linked, alike=True)
+    first, best, *_ = escalated(room, tmp_path, monkeypatch, linked, alike=True)
     assert len(first.registered) == 10 and len(best.registered) >= 10
     assert room.wrong(best) == 0 and not best.folded
 

@@ -3,6 +3,7 @@
 Runs one way over the sets that WORK has no result of, then prints a row for each set, with columns for each way that
 WORK knows. Poses are compared after a similarity; a wrong one is off by more than 5° or a tenth of the cameras' spread.
 
+python tools score.registration DATA WORK --way base --sets bonsai:1      # poses to compare with, where DATA has none
 python tools score.registration DATA WORK --way pycolmap
 PYTHONPATH=OLDER/CHECKOUT python tools score.registration DATA WORK --way base
 python tools score.registration DATA WORK --way now
@@ -25,7 +26,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from perception.errors import InputError
-from perception.geometry import align_similarity
+from perception.geometry import align_similarity, inverse_se3
 from perception.inputs.load import load_scene
 from perception.photos.lens import load_pycolmap
 from perception.sfm.options import ReadOptions
@@ -97,15 +98,18 @@ def pycolmap_defaults(source: Path, work: Path) -> Found:
     return {"poses": {i.name: i.cam_from_world().matrix().tolist() for i in images}, "report": {"models": sizes}}
 
 
-def truth(data: Path, name: str, names: list[str]) -> dict[str, np.ndarray]:
-    """True world_from_camera [3, 4] of the photos `names` of a set, where they are known."""
+def truth(data: Path, work: Path, name: str, names: list[str]) -> dict[str, np.ndarray]:
+    """True world_from_camera [3, 4] of the photos `names` of a set, if known, else those of the set of all."""
     scene, step, *video = name.split(":")
     file = data / scene / POSES.get(scene, "transforms.json")
-    if not file.is_file():
-        return {}
-    frames = json.loads(file.read_text(encoding="utf-8"))["frames"]
-    known = {Path(frame["file_path"]).name: np.array(frame["transform_matrix"])[:3] for frame in frames}
-    known = {each: np.c_[pose[:, :3] @ FLIPPED, pose[:, 3]] for each, pose in known.items()}
+    if file.is_file():
+        frames = json.loads(file.read_text(encoding="utf-8"))["frames"]
+        known = {Path(frame["file_path"]).name: np.array(frame["transform_matrix"])[:3] for frame in frames}
+        known = {each: np.c_[pose[:, :3] @ FLIPPED, pose[:, 3]] for each, pose in known.items()}
+    else:
+        every = sorted((work / "results").glob(f"{scene}_1.*.json"))
+        poses = json.loads(every[0].read_text())["poses"] if every else {}
+        known = {each: inverse_se3(np.vstack([pose, [0, 0, 0, 1]]))[:3] for each, pose in poses.items()}
     if video:
         photos = sorted(photo.name for photo in (data / scene / "images").iterdir())[:: int(step)]
         known = {each: known[photos[int(Path(each).stem)]] for each in names}
@@ -134,9 +138,9 @@ def errors(poses: dict[str, Any], known: dict[str, np.ndarray]) -> tuple[np.ndar
     return away(fits) if fits.sum() >= 3 else best
 
 
-def row(data: Path, name: str, found: Found) -> str:
+def row(data: Path, work: Path, name: str, found: Found) -> str:
     poses, report = found["poses"], found["report"]
-    known = truth(data, name, list(poses))
+    known = truth(data, work, name, list(poses))
     cell = f"{len(poses)} | {found['seconds']:.0f} ({found['cpu']:.0f}) | "
     if len(known) < 3 or len(known) < len(poses):
         return cell + "| | "
@@ -156,7 +160,7 @@ def table(data: Path, work: Path, sets: list[str]) -> None:
         photos = source.parent / "frames" if source.is_file() else source
         for way in ways:
             file = work / "results" / f"{name.replace(':', '_')}.{way}.json"
-            cells += row(data, name, json.loads(file.read_text())) if file.is_file() else "| | | | "
+            cells += row(data, work, name, json.loads(file.read_text())) if file.is_file() else "| | | | "
         count = len([photo for photo in photos.iterdir() if photo.suffix.lower() != ".json"])
         print(f"| {name} | {count} | {cells.strip()}")
 
