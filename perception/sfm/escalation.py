@@ -43,7 +43,7 @@ DOUBT = 4
 MOVED = 0.05
 """Nor if this moves the photos registered before, in the median and relative to their mean distance from the centre."""
 SHARED = 20
-"""Least number of points that a photo shares with two others or more: those of two photos leave a chain's scale open."""
+"""Least number of points that a photo shares with two others: points of two photos alone leave a chain's scale open."""
 CANDIDATES = 4
 """Models mapped anew of which the best is used; two from all pairs, two from the stronger ones."""
 GUIDED = 8
@@ -210,9 +210,9 @@ class Escalation:
         """Without photos that matches contradict or few others hold; where there are such, the rest is adjusted anew.
         again: then photos are added once more, as the wrong ones may have been in the way."""
         best, complete = models[0], models[0].num_reg_images()
-        while out := _unsure(best, store):
-            contradicted = contradicted | {best.images[image].name for image in out}
-            take_out(best, out)
+        while (wrong := _contradicted(best, store)) | (loose := _loose(best)):
+            contradicted = contradicted | {best.images[image].name for image in wrong}
+            take_out(best, wrong | loose)
             if best.num_reg_images() < MIN_MODEL_SIZE:
                 return Candidate([], contradicted, store)
             best = self._adjusted([best], store)
@@ -260,9 +260,13 @@ class Escalation:
         return FeatureStore(folder, store.image_root, names, facts, THOROUGH)
 
 
-def _unsure(model: Any, store: FeatureStore) -> set[int]:
-    """Photos of a model that its matches contradict, or that share less than SHARED points with two others or more."""
-    images = set(model.reg_image_ids())
+def _contradicted(model: Any, store: FeatureStore) -> set[int]:
+    """Photos of a model that the matches of others contradict."""
+    return set(model.reg_image_ids()) - consistent_photos(verified_pairs(model, store.database))
+
+
+def _loose(model: Any) -> set[int]:
+    """Photos of a model that share less than SHARED points with two others."""
     tracks = [point.track.elements for point in model.points3D.values() if point.track.length() > 2]
     shared = Counter(element.image_id for track in tracks for element in track)
-    return images - consistent_photos(verified_pairs(model, store.database)) | {i for i in images if shared[i] < SHARED}
+    return {image for image in model.reg_image_ids() if shared[image] < SHARED}
