@@ -197,14 +197,14 @@ class Escalation:
 
     def _adjusted(self, models: list[Any], store: FeatureStore) -> Any:
         """One model of aligned ones, adjusted to all matches of the store."""
-        few = len(store.names) <= REPEATABLE_PHOTOS
-        options = pipeline_options(self.fixed, self.options.seed, few, store.effort)
+        options = pipeline_options(self.fixed, self.options.seed, one_thread=True, effort=store.effort)
         return merge.adjusted(merge.merged(models), store, options, add=False)
 
     def _grown(self, start: Any, store: FeatureStore, again: bool = True) -> Candidate:
         """`start` with photos added."""
         seed, count, progress = self.options.seed, len(store.names), self.options.progress
-        return self._checked(*map_photos(store, self.fixed, seed, count, progress, start=start), store, again)
+        found = map_photos(store, self.fixed, seed, count, progress, one_thread=True, start=start)
+        return self._checked(*found, store, again)
 
     def _checked(self, models: list[Any], contradicted: set[str], store: FeatureStore, again: bool = True) -> Candidate:
         """Without photos that matches contradict or few others hold; where there are such, the rest is adjusted anew.

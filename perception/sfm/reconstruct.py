@@ -58,7 +58,7 @@ def reconstruct(folder: Path, options: ReadOptions) -> Scene:
     views, facts = views_of_model(model, located, folder, options)
     points, colors = cloud_of(model)
     report["left_out"] = sorted([*chosen.left_out, *report["left_out"]], key=lambda entry: entry["name"])
-    notes = [*chosen.notes, *_brought(report["steps"], len(photos))]
+    notes = [*chosen.notes, *_brought(report.get("steps", []), len(photos))]
     return Scene(views, points, colors, report={**report, "exposure": facts["exposure"], "notes": notes})
 
 
@@ -87,7 +87,7 @@ def _map(store: FeatureStore, chosen: PhotoSet, folder: Path, options: ReadOptio
             advice = "take sharp, overlapping photos of a textured scene from different positions"
             raise InputError(f"{folder}: none of the {count} photos could be registered; {advice}")
         seconds |= {step["step"]: step["seconds"] for step in steps[1:]}
-        report = {**_report(best, chosen.names, seconds), "steps": steps}
+        report = _report(best, chosen.names, seconds) | ({"steps": steps} if steps else {})
         with atomic_directory(done) as new:
             best.models[0].write(new)
             (new / "report.json").write_text(json.dumps(report))
@@ -113,7 +113,7 @@ def _at_once(store: FeatureStore, fixed: bool, options: ReadOptions) -> Candidat
 
 def _brought(steps: list[dict[str, Any]], count: int) -> list[str]:
     """A note on the steps for photos that are not registered at once, if there were any."""
-    if len(steps) < 2:
+    if not steps:
         return []
     gains = [(step["step"], step["registered"] - before["registered"]) for before, step in pairwise(steps)]
     told = ", ".join(f"{name} added {gain or 'none'}" for name, gain in gains)
