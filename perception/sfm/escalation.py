@@ -131,9 +131,12 @@ class Escalation:
         return across.count(False) * DOUBT > len(across)
 
     def _linked(self, store: FeatureStore) -> dict[tuple[int, int], int]:
-        """Verified matches of the pairs of photos, by image ids, of which one or both are not registered."""
-        done, verified = self.best.registered, verified_matches(store.database)
-        return {pair: len(found) for pair, found in verified.items() if len(found) and not done >= set(pair)}
+        """Verified matches of the pairs of photos, by image ids, that are not in one model."""
+        done = [set(model.reg_image_ids()) for model in self.best.models]
+        verified = verified_matches(store.database).items()
+        return {
+            pair: len(found) for pair, found in verified if len(found) and not any(each >= set(pair) for each in done)
+        }
 
     # ------------------------------------------------------------------ steps
 
