@@ -51,11 +51,16 @@ def model_warnings(models: list[Any], database: Path, photos: int) -> list[str]:
         sizes = ", ".join(str(model.num_reg_images()) for model in models)
         split = f"the photos split into {len(models)} unconnected models ({sizes}); the largest is mapped"
         warnings.append(f"{split}; for another, put the photos that are left out into a folder of their own")
-    pairs = verified_pairs(best, database)
+    return warnings + fold_warnings(best, database)
+
+
+def fold_warnings(model: Any, database: Path) -> list[str]:
+    """Warnings, one line each, that different parts of the scene may lie on top of each other in a pycolmap model."""
+    pairs, warnings = verified_pairs(model, database), []
     if len(pairs) >= 5 and is_contradicted(pairs):
         wrong = f"{len(stronger_contradictions(pairs))} of {len(pairs)} matched photo pairs contradict the model"
         warnings.append(f"{wrong} and are stronger than the pairs it rests on: it may be folded (equal textures?)")
-    unmatched, near = _unmatched_neighbors(best, {(pair.i, pair.j) for pair in pairs})
+    unmatched, near = _unmatched_neighbors(model, {(pair.i, pair.j) for pair in pairs})
     if near >= 5 and unmatched > MAX_UNMATCHED * near:
         alike = f"{unmatched} of {near} photo pairs that the model puts at one position, looking the same way"
         warnings.append(f"{alike}, do not match: it may be folded (equal textures?)")
@@ -86,6 +91,41 @@ def outvoted_photos(pairs: list[Pair]) -> set[int]:
     for pair in pairs:
         votes.update(dict.fromkeys((pair.i, pair.j), pair.inliers if pair.agrees else -pair.inliers))
     return {image for image, vote in votes.items() if vote < 0}
+
+
+def consistent_photos(pairs: list[Pair]) -> set[int]:
+    """The largest set of photos of a model that no contradicted pair divides, each with more agreeing pairs than not.
+
+    From the strongest pair to the weakest, an agreeing pair joins the sets of its photos and a contradicted one forbids
+    that they are joined (Wolf et al., "The mutex watershed", ECCV 2018).
+    """
+    members: dict[int, set[int]] = {image: {image} for pair in pairs for image in (pair.i, pair.j)}
+    apart: dict[int, set[int]] = {image: set() for image in members}
+    """By photo, those that may not be in its set."""
+    for pair in sorted(pairs, key=lambda p: (-p.inliers, not p.agrees)):
+        one, other = members[pair.i], members[pair.j]
+        if one is other:
+            continue
+        if not pair.agrees:
+            apart[pair.i].add(pair.j)
+            apart[pair.j].add(pair.i)
+        elif not any(apart[image] & other for image in one):
+            one |= other
+            members |= dict.fromkeys(other, one)
+    kept = max(members.values(), key=lambda images: (len(images), -min(images)), default=set())
+    while wrong := {image for image, votes in _votes(pairs, kept).items() if votes <= 0}:
+        kept = kept - wrong
+    return kept
+
+
+def _votes(pairs: list[Pair], photos: set[int]) -> dict[int, int]:
+    """Of each photo, the agreeing pairs less the contradicted ones, among `photos`."""
+    votes = dict.fromkeys(photos, 0)
+    for pair in pairs:
+        if pair.i in photos and pair.j in photos:
+            votes[pair.i] += 1 if pair.agrees else -1
+            votes[pair.j] += 1 if pair.agrees else -1
+    return votes
 
 
 def verified_pairs(model: Any, database: Path) -> list[Pair]:

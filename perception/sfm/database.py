@@ -17,6 +17,7 @@ from perception.photos.ignore_masks import stage_masks
 from perception.photos.lens import load_pycolmap
 from perception.sfm import features, pairs
 from perception.sfm.feature_tasks import FeatureTasks
+from perception.sfm.features import QUICK, Effort
 from perception.sfm.options import ReadOptions
 from perception.sfm.staging import stage_photos
 from perception.types import Lens
@@ -28,12 +29,13 @@ POSED_PARTNERS = 12
 @dataclass(frozen=True)
 class FeatureStore:
     """A folder with the COLMAP `database.db`. image_root: of the photos under numbered names (see staging).
-    names[i] is the name of the i-th photo in both. facts: numbers of pairs, seconds."""
+    names[i] is the name of the i-th photo in both. facts: numbers of pairs, seconds. effort: of its features."""
 
     folder: Path
     image_root: Path
     names: list[str]
     facts: dict[str, Any]
+    effort: Effort = QUICK
 
     @property
     def database(self) -> Path:

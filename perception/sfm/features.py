@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,26 @@ from perception.types import Lens
 
 MAX_IMAGE_SIDE = 1600
 """Larger photos are downscaled for feature extraction only; keypoints are in full-resolution pixels."""
-MAX_FEATURES, MIN_FEATURES = 2048, 450
+MIN_FEATURES = 450
 """Photos with fewer than MIN_FEATURES are extracted again at double size (first octave −1), at four times the cost."""
 PEAK_THRESHOLD = 0.004
-MIN_INLIERS = 20
-"""Least number of verified matches of a pair of photos."""
 PAIRS_AT_ONCE = 2000
 """Pairs between two steps of the progress bar."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """features: most of a photo. octave: the first, −1 is the image at double size. inliers: least number of verified
+    matches of a pair of photos. trials: most of RANSAC."""
+
+    features: int
+    octave: int
+    inliers: int
+    trials: int
+
+
+QUICK, THOROUGH = Effort(2048, 0, 20, 2000), Effort(8192, -1, 15, 10_000)
+"""THOROUGH has COLMAP's defaults."""
 Group = tuple[list[str], Any]
 """Names of the photos of one camera, and the pycolmap.ImageReaderOptions for them."""
 
@@ -31,8 +45,16 @@ def import_photos(
 ) -> list[Group]:
     """Creates the database with cameras and images. This fixes the image ids, which otherwise depend on the timing of
     threads; later random choices depend on the ids."""
-    pycolmap = load_pycolmap()
+    pycolmap, groups = load_pycolmap(), camera_groups(root, photos, names, lenses)
     pycolmap.Database.open(database).close()  # creates the file
+    for group in groups:
+        pycolmap.import_images(database, root, pycolmap.CameraMode.SINGLE, *group)
+    return groups
+
+
+def camera_groups(root: Path, photos: list[Path], names: list[str], lenses: list[Lens | None]) -> list[Group]:
+    """The photos of each camera."""
+    pycolmap = load_pycolmap()
     cameras: dict[Any, list[int]] = {}
     for index, photo in enumerate(photos):
         cameras.setdefault(lenses[index] or _camera_key(photo), []).append(index)
@@ -45,11 +67,10 @@ def import_photos(
             reader.camera_model = lens.model
             reader.camera_params = ", ".join(map(repr, lens.params))
         groups.append(([names[i] for i in members], reader))
-        pycolmap.import_images(database, root, pycolmap.CameraMode.SINGLE, *groups[-1])
     return groups
 
 
-def extract(database: Path, root: Path, groups: list[Group], progress: Progress) -> None:
+def extract(database: Path, root: Path, groups: list[Group], progress: Progress, effort: Effort = QUICK) -> None:
     """Extracts the features of imported photos."""
     pycolmap = load_pycolmap()
     done, count = 0, sum(len(names) for names, _ in groups)
@@ -57,11 +78,11 @@ def extract(database: Path, root: Path, groups: list[Group], progress: Progress)
         options = pycolmap.FeatureExtractionOptions()
         options.use_gpu = False
         options.max_image_size = MAX_IMAGE_SIDE
-        options.sift.max_num_features = MAX_FEATURES
+        options.sift.max_num_features = effort.features
         options.sift.peak_threshold = PEAK_THRESHOLD
-        options.sift.first_octave = 0
+        options.sift.first_octave = effort.octave
         pycolmap.extract_features(database, root, names, pycolmap.CameraMode.SINGLE, reader, options)
-        poor = _drop_poor(database, names)
+        poor = _drop_poor(database, names) if effort.octave == 0 else []
         if poor:
             options.sift.first_octave = -1
             pycolmap.extract_features(database, root, poor, pycolmap.CameraMode.SINGLE, reader, options)
@@ -89,8 +110,16 @@ def _camera_key(photo: Path) -> tuple[Any, ...]:
     return (*photo_size(photo), exif.get(0x010F), exif.get(0x0110), details.get(0x920A), details.get(0xA404))
 
 
-def match(database: Path, chosen: Sequence[Sequence[str]], seed: int, progress: Progress) -> None:
-    """Matches and verifies the chosen pairs of photos, given by their names in the database."""
+def match(
+    database: Path,
+    chosen: Sequence[Sequence[str]],
+    seed: int,
+    progress: Progress,
+    effort: Effort = QUICK,
+    guided: bool = False,
+) -> None:
+    """Matches and verifies the chosen pairs of photos, given by their names in the database.
+    guided: once more, along the epipolar lines of what is verified, where more features have only one candidate."""
     pycolmap = load_pycolmap()
     progress.update("poses: matching", 0, len(chosen))
     matching = pycolmap.FeatureMatchingOptions()
@@ -98,16 +127,18 @@ def match(database: Path, chosen: Sequence[Sequence[str]], seed: int, progress: 
     # The index of descriptors is trained with OpenBLAS, in pycolmap's wheel one without threads or locks. With several
     # threads it differed now and then, and with it the matches. The verification uses all threads.
     matching.num_threads = 1
-    matching.skip_geometric_verification = True
+    matching.skip_geometric_verification = not guided
+    matching.guided_matching = guided
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
-    verification.ransac.max_num_trials = 2000
-    verification.min_num_inliers = MIN_INLIERS
+    verification.ransac.max_num_trials = effort.trials
+    verification.min_num_inliers = effort.inliers
     listed = pycolmap.ImportedPairingOptions()
     listed.match_list_path = database.with_name("pairs.txt")
     for first in range(0, len(chosen), PAIRS_AT_ONCE):
         some = chosen[first : first + PAIRS_AT_ONCE]
         listed.match_list_path.write_text("".join(f"{one} {other}\n" for one, other in some))
-        pycolmap.match_image_pairs(database, matching, listed)
-        pycolmap.verify_matches(database, listed.match_list_path, verification)
+        pycolmap.match_image_pairs(database, matching, listed, verification)
+        if not guided:
+            pycolmap.verify_matches(database, listed.match_list_path, verification)
         progress.update("poses: matching", first + len(some), len(chosen))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -13,41 +14,58 @@ from perception.photos.lens import load_pycolmap
 from perception.progress import Progress
 from perception.sfm.consistency import Pair, is_contradicted, outvoted_photos, verified_pairs
 from perception.sfm.database import FeatureStore
-from perception.sfm.features import MIN_INLIERS
+from perception.sfm.features import QUICK, Effort
 
 MIN_MODEL_SIZE = 3
 REPEATABLE_PHOTOS = 150
 """Up to this many photos are mapped by one thread, which makes the result repeatable bit for bit."""
 Mapped = tuple[list[Any], set[str]]
 """Models, largest first, and the names of the photos left out because most of their matches contradict the largest."""
-LEVELS = (MIN_INLIERS, 2 * MIN_INLIERS, 4 * MIN_INLIERS, 8 * MIN_INLIERS)
-"""Least verified matches of a pair, tried in turn until the model contradicts no pair stronger than those it uses."""
+LEVELS = (1, 2, 4, 8)
+"""Least verified matches of a pair, as multiples of the store's, tried in turn until the model contradicts no pair
+stronger than those it uses."""
 
 
-def pipeline_options(fixed: bool, seed: int, one_thread: bool) -> Any:
+def pipeline_options(fixed: bool, seed: int, one_thread: bool, effort: Effort = QUICK) -> Any:
     """pycolmap.IncrementalPipelineOptions. fixed: the intrinsics are not refined. With one thread, results repeat."""
     options = load_pycolmap().IncrementalPipelineOptions()
     options.random_seed = seed
     if one_thread:
         options.num_threads = 1
-    options.min_num_matches = MIN_INLIERS
+    options.min_num_matches = effort.inliers
     options.min_model_size = MIN_MODEL_SIZE
-    options.structure_less_registration_fallback = False
-    # Global bundle adjustment at every 40 % of growth, not 10 %, as it takes most of the mapping time.
-    options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
-    options.ba_global_max_refinements = 3
+    if effort == QUICK:
+        options.structure_less_registration_fallback = False
+        # Global bundle adjustment at every 40 % of growth, not 10 %, as it takes most of the mapping time.
+        options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
+        options.ba_global_max_refinements = 3
     options.ba_refine_focal_length = options.ba_refine_extra_params = not fixed
     return options
 
 
 def map_photos(
-    store: FeatureStore, fixed: bool, seed: int, count: int, progress: Progress, one_thread: bool = False
+    store: FeatureStore,
+    fixed: bool,
+    seed: int,
+    count: int,
+    progress: Progress,
+    one_thread: bool = False,
+    start: Any | None = None,
 ) -> Mapped:
     """All models, largest first (pycolmap does not sort them), and names of photos left out as contradicted.
-    fixed: the intrinsics in the database are not refined. one_thread: also for more than REPEATABLE_PHOTOS photos."""
+    fixed: the intrinsics in the database are not refined. one_thread: also for more than REPEATABLE_PHOTOS photos.
+    start: a model of the store's features, to which photos are added."""
     with TemporaryDirectory(dir=store.folder) as folder:
         one_thread = one_thread or count <= REPEATABLE_PHOTOS
-        return _Mapping(store, Path(folder), fixed, seed, count, progress, one_thread).run()
+        mapping = _Mapping(store, Path(folder), fixed, seed, count, progress, one_thread)
+        return mapping.run() if start is None else mapping.extended(start)
+
+
+def candidates(store: FeatureStore, fixed: bool, seed: int, progress: Progress, most: int) -> Iterator[Mapped]:
+    """As `map_photos`, of one thread, but all that it chooses from, at most `most`."""
+    with TemporaryDirectory(dir=store.folder) as folder:
+        mapping = _Mapping(store, Path(folder), fixed, seed, len(store.names), progress, one_thread=True)
+        yield from islice(mapping.candidates(), most)
 
 
 @dataclass
@@ -67,24 +85,29 @@ class _Mapping:
     def run(self) -> Mapped:
         """The first model that is not contradicted, else the one with most agreeing matches."""
         tried: list[tuple[int, Mapped]] = []
-        for found in self._candidates():
+        for found in self.candidates():
             pairs = verified_pairs(found[0][0], self.store.database)
             tried.append((sum(pair.inliers for pair in pairs if pair.agrees), found))
             if not is_contradicted(pairs):
                 break
         return max(tried, key=lambda item: item[0], default=(0, ([], set())))[1]
 
-    def _candidates(self) -> Iterator[Mapped]:
+    def extended(self, start: Any) -> Mapped:
+        """`start` with the photos that can be added to it."""
+        return self._without_outvoted(self._map(self.store.database, self.store.effort.inliers, start) or [start])
+
+    def candidates(self) -> Iterator[Mapped]:
         """For each level: a model from its pairs, then one from all pairs except those that the first contradicts."""
+        least = self.store.effort.inliers
         for level in LEVELS:
-            models = self._map(self.store.database, level)
+            models = self._map(self.store.database, level * least)
             if not models:
                 return
             found = self._without_outvoted(models)
             yield found
             pairs = verified_pairs(found[0][0], self.store.database)
             wrong = [pair for pair in pairs if not pair.agrees]
-            again = self._map(self._database_without(wrong), LEVELS[0]) if wrong else []
+            again = self._map(self._database_without(wrong), least) if wrong else []
             if again:
                 yield self._without_outvoted(again)
 
@@ -105,11 +128,8 @@ class _Mapping:
         if not wrong or len(wrong) > best.num_reg_images() / 4:
             return models, set()
         take_out(best, wrong)
-        source = self.folder / f"kept-{self.runs}"
-        source.mkdir()
-        best.write(source)
         others = [p for p in pairs if not p.agrees and p.i not in wrong and p.j not in wrong]
-        again = self._map(self._database_without(others), LEVELS[0], source)
+        again = self._map(self._database_without(others), self.store.effort.inliers, best)
         best = again[0] if again and again[0].num_reg_images() >= best.num_reg_images() else best
         still = outvoted_photos(verified_pairs(best, self.store.database))
         still |= wrong - set(best.reg_image_ids())
@@ -117,12 +137,16 @@ class _Mapping:
         take_out(best, still & set(best.reg_image_ids()))
         return [best, *models[1:]], names
 
-    def _map(self, database: Path, min_inliers: int, source: Path | None = None) -> list[Any]:
+    def _map(self, database: Path, min_inliers: int, start: Any | None = None) -> list[Any]:
         pycolmap = load_pycolmap()
-        options = pipeline_options(self.fixed, self.seed, self.one_thread)
+        options = pipeline_options(self.fixed, self.seed, self.one_thread, self.store.effort)
         options.min_num_matches = min_inliers
-        options.multiple_models = source is None
+        options.multiple_models = start is None
         self.runs += 1
+        source = self.folder / f"start-{self.runs}"
+        if start is not None:
+            source.mkdir()
+            start.write(source)
         out = self.folder / f"run-{self.runs}"
         out.mkdir()
         registered = 2
@@ -134,10 +158,27 @@ class _Mapping:
             self.progress.update("poses: mapping", round(100 * self.shown), 100)
 
         found = pycolmap.incremental_mapping(
-            database, self.store.image_root, out, options, input_path=source or "", next_image_callback=next_image
+            database,
+            self.store.image_root,
+            out,
+            options,
+            input_path=source if start is not None else "",
+            next_image_callback=next_image,
         )
         models = [model for model in found.values() if model.num_reg_images() >= MIN_MODEL_SIZE]
         return sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+
+
+def write_models(models: list[Any], folder: Path) -> None:
+    """Writes models into folders of their own in `folder`, which `read_models` reads in the same order."""
+    for number, model in enumerate(models):
+        (folder / f"{number:04}").mkdir()
+        model.write(folder / f"{number:04}")
+
+
+def read_models(folder: Path) -> list[Any]:
+    """The models that `write_models` has written."""
+    return [load_pycolmap().Reconstruction(each) for each in sorted(folder.iterdir()) if each.is_dir()]
 
 
 def take_out(model: Any, images: set[int]) -> None:

@@ -82,8 +82,9 @@ def merged(models: Sequence[Any]) -> Any:
     return model
 
 
-def adjusted(model: Any, store: FeatureStore, options: Any) -> Any:
-    """Points of all matches; then poses, points and intrinsics adjusted together, again where photos were missing."""
+def adjusted(model: Any, store: FeatureStore, options: Any, add: bool = True) -> Any:
+    """Points of all matches; then poses, points and intrinsics adjusted together, again where photos were missing.
+    add: photos that are missing are added."""
     pycolmap = load_pycolmap()
     with TemporaryDirectory(dir=store.folder) as out:
         model = pycolmap.triangulate_points(model, store.database, store.image_root, out, True, options)
@@ -99,7 +100,7 @@ def adjusted(model: Any, store: FeatureStore, options: Any) -> Any:
     mapper.iterative_global_refinement(*limits, options.get_mapper(), adjustment, triangulation)
     added = False
     # Photos that no submodel has: `any` ends at the first that is registered, after which others may be.
-    while any(_register(mapper, image, options) for image in mapper.find_next_images(options.get_mapper(), False)):
+    while add and any(_register(mapper, i, options) for i in mapper.find_next_images(options.get_mapper(), False)):
         added = True
     if added:
         mapper.iterative_global_refinement(*limits, options.get_mapper(), adjustment, triangulation)

@@ -36,7 +36,7 @@ def select_pairs(database: Path, names: list[str], most: int, progress: Progress
     count = len(names)
     if count < EXHAUSTIVE_BELOW:
         return list(combinations(range(count), 2))
-    descriptors = _largest_features(database, names)
+    descriptors = largest_features(database, names)
     compared = similar_photos(descriptors) if count > RETRIEVED_ABOVE else np.ones((count, count), bool)
     votes = coarse_votes(descriptors, compared, progress)
     pairs = {(i, j) for i in range(count) for j in range(i + 1, min(i + NEIGHBORS + 1, count))}
@@ -83,7 +83,8 @@ def similar_photos(descriptors: list[np.ndarray]) -> np.ndarray:
     return similar | similar.T | np.eye(count, dtype=bool)
 
 
-def _largest_features(database: Path, names: list[str]) -> list[np.ndarray]:
+def largest_features(database: Path, names: list[str]) -> list[np.ndarray]:
+    """Unit descriptors [F, 128] of the COARSE_FEATURES largest features of each photo."""
     pycolmap = load_pycolmap()
     result = []
     with pycolmap.Database.open(database) as db:

@@ -8,7 +8,9 @@ micrometres from run to run, or in one piece by several threads.
 from __future__ import annotations
 
 import json
+import shutil
 import time
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +22,17 @@ from perception.photos.ignore_masks import mask_of
 from perception.photos.lens import lens_from_camera, lens_text, load_pycolmap
 from perception.sfm.consistency import model_warnings
 from perception.sfm.database import FeatureStore, build_features, verified_matches
-from perception.sfm.incremental import REPEATABLE_PHOTOS, map_photos
+from perception.sfm.escalation import MORE, Candidate, Escalation
+from perception.sfm.features import camera_groups
+from perception.sfm.incremental import REPEATABLE_PHOTOS, map_photos, read_models, write_models
 from perception.sfm.model import cloud_of, views_of_model
 from perception.sfm.options import ReadOptions
 from perception.sfm.submodels import map_submodels
 from perception.types import Scene
 
 MIN_PHOTOS = 3
+AT_ONCE = "at-once"
+"""Folder in that of the features."""
 
 
 def reconstruct(folder: Path, options: ReadOptions) -> Scene:
@@ -52,7 +58,8 @@ def reconstruct(folder: Path, options: ReadOptions) -> Scene:
     views, facts = views_of_model(model, located, folder, options)
     points, colors = cloud_of(model)
     report["left_out"] = sorted([*chosen.left_out, *report["left_out"]], key=lambda entry: entry["name"])
-    return Scene(views, points, colors, report={**report, "exposure": facts["exposure"], "notes": chosen.notes})
+    notes = [*chosen.notes, *_brought(report.get("steps", []), len(photos))]
+    return Scene(views, points, colors, report={**report, "exposure": facts["exposure"], "notes": notes})
 
 
 def _too_few(folder: Path, chosen: PhotoSet) -> InputError:
@@ -71,22 +78,50 @@ def _map(store: FeatureStore, chosen: PhotoSet, folder: Path, options: ReadOptio
     recover(done)
     if not done.is_dir():
         started, count = time.perf_counter(), len(chosen.photos)
-        found = map_submodels(store, fixed, options) if count > REPEATABLE_PHOTOS else None
-        models, contradicted = found or map_photos(store, fixed, options.seed, count, options.progress)
-        if not models:
+        best, steps = _at_once(store, fixed, options), list[dict[str, Any]]()
+        seconds = {**store.facts["seconds"], "mapping": time.perf_counter() - started}
+        if len(best.registered) < count:
+            groups = camera_groups(store.image_root, chosen.photos, store.names, [options.lens] * count)
+            best, steps = Escalation(best, groups, fixed, options).run()
+        if not best.models:
             advice = "take sharp, overlapping photos of a textured scene from different positions"
             raise InputError(f"{folder}: none of the {count} photos could be registered; {advice}")
-        seconds = {**store.facts["seconds"], "mapping": time.perf_counter() - started}
-        report = _report(models, contradicted, store, chosen.names, seconds)
+        seconds |= {step["step"]: step["seconds"] for step in steps[1:]}
+        report = _report(best, chosen.names, seconds) | ({"steps": steps} if steps else {})
         with atomic_directory(done) as new:
-            models[0].write(new)
+            best.models[0].write(new)
             (new / "report.json").write_text(json.dumps(report))
+    for folder in (store.folder / AT_ONCE, store.folder / MORE):
+        shutil.rmtree(folder, ignore_errors=True)
     return load_pycolmap().Reconstruction(done), json.loads((done / "report.json").read_text())
 
 
-def _report(
-    models: list[Any], contradicted: set[str], store: FeatureStore, shown: list[str], seconds: dict[str, float]
-) -> dict[str, Any]:
+def _at_once(store: FeatureStore, fixed: bool, options: ReadOptions) -> Candidate:
+    """The models by the features and pairs of the store. Where they lack photos, they are kept for a later call."""
+    folder, count = store.folder / AT_ONCE, len(store.names)
+    recover(folder)
+    if not folder.is_dir():
+        found = map_submodels(store, fixed, options) if count > REPEATABLE_PHOTOS else None
+        models, contradicted = found or map_photos(store, fixed, options.seed, count, options.progress)
+        if models and models[0].num_reg_images() == count:
+            return Candidate(models, contradicted, store)
+        with atomic_directory(folder) as new:
+            write_models(models, new)
+            (new / "contradicted.json").write_text(json.dumps(sorted(contradicted)))
+    return Candidate(read_models(folder), set(json.loads((folder / "contradicted.json").read_text())), store)
+
+
+def _brought(steps: list[dict[str, Any]], count: int) -> list[str]:
+    """A note on the steps for photos that are not registered at once, if there were any."""
+    if not steps:
+        return []
+    gains = [(step["step"], step["registered"] - before["registered"]) for before, step in pairwise(steps)]
+    told = ", ".join(f"{name} added {gain or 'none'}" for name, gain in gains)
+    return [f"poses: {steps[0]['registered']} of {count} photos registered at once; {told}"]
+
+
+def _report(found: Candidate, shown: list[str], seconds: dict[str, float]) -> dict[str, Any]:
+    models, contradicted, store = found.models, found.contradicted, found.store
     best, matches = models[0], _best_partners(store)
     inside = [{model.images[i].name for i in model.reg_image_ids()} for model in models]
     outside = [(name, photo) for name, photo in zip(store.names, shown, strict=True) if name not in inside[0]]

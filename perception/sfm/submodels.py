@@ -11,13 +11,20 @@ import shutil
 from pathlib import Path
 
 from perception.io.atomic import atomic_directory
-from perception.photos.lens import load_pycolmap
 from perception.progress import QUIET, Progress
 from perception.sfm import merge, partition
 from perception.sfm.consistency import is_contradicted, outvoted_photos, verified_pairs
 from perception.sfm.database import FeatureStore, verified_matches
 from perception.sfm.feature_tasks import write_part
-from perception.sfm.incremental import MIN_MODEL_SIZE, Mapped, map_photos, pipeline_options, take_out
+from perception.sfm.incremental import (
+    MIN_MODEL_SIZE,
+    Mapped,
+    map_photos,
+    pipeline_options,
+    read_models,
+    take_out,
+    write_models,
+)
 from perception.sfm.options import ReadOptions
 from perception.tasks.folder import RESULT, has_task, read_facts, run_tasks, write_task
 
@@ -31,8 +38,7 @@ def map_submodels(store: FeatureStore, fixed: bool, options: ReadOptions) -> Map
     submodels = partition.with_overlap(partition.divide(counts, partition.LARGEST), counts)
     folders = [_task(store, images, number, fixed, seed) for number, images in enumerate(submodels)]
     results = run_tasks(options.engine, submodel_task, folders, "poses: submodel", progress, each_core=True)
-    read = load_pycolmap().Reconstruction
-    models = [read(model) for result in results for model in sorted(result.iterdir())]
+    models = [model for result in results for model in read_models(result)]
     groups = merge.align(merge.without_repeats(models), seed)
     if not groups:
         return None
@@ -71,6 +77,4 @@ def submodel_task(task: str, progress: Progress = QUIET) -> None:
     store = FeatureStore(folder, Path(facts["photos"]), [], {})
     models, _ = map_photos(store, facts["fixed"], facts["seed"], facts["count"], progress, one_thread=True)
     with atomic_directory(folder / RESULT) as new:
-        for number, model in enumerate(models):
-            (new / str(number)).mkdir()
-            model.write(new / str(number))
+        write_models(models, new)

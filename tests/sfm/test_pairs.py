@@ -45,7 +45,7 @@ def test_photos_of_one_place_are_similar_also_rounds_apart() -> None:
 
 def test_pairs_of_many_photos_are_those_that_overlap(monkeypatch: pytest.MonkeyPatch) -> None:
     descriptors, shared = walk(205)
-    monkeypatch.setattr(module, "_largest_features", lambda *_: descriptors)
+    monkeypatch.setattr(module, "largest_features", lambda *_: descriptors)
     pairs = module.select_pairs(Path(), [""] * 205, 205, Told())
     assert pairs == sorted({(i, j) for i, j in pairs if i < j})
     chosen = np.zeros((205, 205), bool)
@@ -57,7 +57,7 @@ def test_pairs_of_many_photos_are_those_that_overlap(monkeypatch: pytest.MonkeyP
 def test_of_few_photos_all_pairs_are_compared(monkeypatch: pytest.MonkeyPatch) -> None:
     """With the same votes as comparing each two photos alone."""
     descriptors, _ = walk(30)
-    monkeypatch.setattr(module, "_largest_features", lambda *_: descriptors)
+    monkeypatch.setattr(module, "largest_features", lambda *_: descriptors)
     monkeypatch.setattr(module, "similar_photos", None)
     module.select_pairs(Path(), [""] * 30, 30, Told())
     votes = module.coarse_votes(descriptors, np.ones((30, 30), bool), Told())

@@ -15,9 +15,11 @@ from scipy.spatial.transform import Rotation
 from perception.geometry import align_similarity, inverse_se3
 from perception.inputs.load import load_scene
 from perception.photos.lens import load_pycolmap
-from perception.sfm import consistency, features
+from perception.sfm import consistency, escalation, features, reconstruct
 from perception.sfm.consistency import Pair
 from perception.sfm.database import build_features
+from perception.sfm.escalation import Escalation
+from perception.sfm.incremental import take_out
 from perception.sfm.options import ReadOptions
 from support.aimed import look_at
 from support.progress import Told
@@ -159,6 +161,53 @@ def test_a_wrecked_model_raises_a_warning(run, wrecked):
         frame.rig_from_world = pycolmap.Rigid3d((frame.rig_from_world.matrix() @ matrix_4x4(half_turn))[:3])
     warnings = consistency.model_warnings([model], store / "database.db", VIEWS)
     assert len(warnings) == 1 and "folded" in warnings[0]
+
+
+def test_photos_that_are_registered_at_once_take_no_further_step(run):
+    scene, _, workdir = run
+    assert "steps" not in scene.report and scene.report["notes"] == []
+    (store,) = workdir.glob("features-*")
+    assert {path.name for path in store.iterdir()} == {"database.db", "facts.json", "model", "pairs.txt", "photos"}
+
+
+def lacking(monkeypatch, photos):
+    """From here on the first way to map lacks the last photos."""
+
+    def some(*args, **rest):
+        models, contradicted = map_photos(*args, **rest)
+        take_out(models[0], set(sorted(models[0].reg_image_ids())[-photos:]))
+        return models, contradicted
+
+    map_photos = reconstruct.map_photos
+    monkeypatch.setattr(reconstruct, "map_photos", some)
+
+
+def test_photos_left_out_are_added_and_an_interrupted_call_goes_on(corner, tmp_path, monkeypatch):
+    lacking(monkeypatch, 3)
+    whole = load_scene(corner[0], ReadOptions(tmp_path / "whole"))
+    assert whole.report["registered"] == VIEWS and not whole.report["left_out"]
+    assert [(step["step"], step["registered"]) for step in whole.report["steps"]] == [
+        ("at once", VIEWS - 3),
+        ("more features", VIEWS),
+    ]
+    assert whole.report["notes"] == [f"poses: {VIEWS - 3} of {VIEWS} photos registered at once; more features added 3"]
+    center, turned = errors(whole, corner[1])
+    assert center < 0.02 and turned < 0.5
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as stopped, pytest.raises(KeyboardInterrupt):
+        stopped.setattr(Escalation, "_grow", stop)
+        load_scene(corner[0], ReadOptions(tmp_path / "parts"))
+    for name in ("extract", "match"):
+        monkeypatch.setattr(escalation, name, None)
+    monkeypatch.setattr(reconstruct, "map_photos", None)
+    parts = load_scene(corner[0], ReadOptions(tmp_path / "parts"))
+    for a, b in zip(whole.views, parts.views, strict=True):
+        np.testing.assert_array_equal(a.camera_from_world, b.camera_from_world)
+    (store,) = (tmp_path / "parts").glob("features-*")
+    assert not (store / escalation.MORE).exists() and not (store / reconstruct.AT_ONCE).exists()
 
 
 def matrix_4x4(transform):

@@ -1,0 +1,275 @@
+"""More effort for photos that structure from motion leaves out at once.
+
+A step counts only if it registers more photos, is not folded, and agrees with at least as many matches as before.
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from functools import cached_property
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from perception.geometry import align_similarity
+from perception.io.atomic import atomic_directory, recover
+from perception.photos.lens import load_pycolmap
+from perception.sfm import merge
+from perception.sfm.consistency import consistent_photos, fold_warnings, verified_pairs
+from perception.sfm.database import FeatureStore, verified_matches
+from perception.sfm.feature_tasks import write_part
+from perception.sfm.features import THOROUGH, Group, extract, match
+from perception.sfm.incremental import (
+    MIN_MODEL_SIZE,
+    REPEATABLE_PHOTOS,
+    candidates,
+    map_photos,
+    pipeline_options,
+    take_out,
+)
+from perception.sfm.options import ReadOptions
+from perception.sfm.pairs import largest_features, similar_photos
+
+MORE = "more"
+"""Folder in that of the features at once."""
+ALL_PAIRS = 150
+"""Of up to so many photos, those left out are matched with all others; of more, with the most similar."""
+DOUBT = 4
+"""Photos are not added if over 1/DOUBT of the matched pairs between them and the others contradict their poses."""
+MOVED = 0.05
+"""Nor if this moves the photos registered before, in the median and relative to their mean distance from the centre."""
+SHARED = 20
+"""Least number of points that a photo shares with two others: points of two photos alone leave a chain's scale open."""
+CANDIDATES = 4
+"""Models mapped anew of which the best is used; two from all pairs, two from the stronger ones."""
+GUIDED = 8
+"""Each photo left out is matched by guidance with so many photos, those with which it has most verified matches."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Models of the features of `store`, largest first, and the names of photos left out as contradicting the first."""
+
+    models: list[Any]
+    contradicted: set[str]
+    store: FeatureStore
+
+    @cached_property
+    def registered(self) -> set[int]:
+        """Image ids of the photos of the largest model."""
+        return set(self.models[0].reg_image_ids()) if self.models else set()
+
+    @cached_property
+    def folded(self) -> bool:
+        """Whether the largest model may be folded."""
+        return bool(self.models) and bool(fold_warnings(self.models[0], self.store.database))
+
+    @cached_property
+    def support(self) -> int:
+        """Verified matches of the pairs that agree with the largest model, less those of the pairs that contradict."""
+        pairs = verified_pairs(self.models[0], self.store.database) if self.models else []
+        return sum(pair.inliers if pair.agrees else -pair.inliers for pair in pairs)
+
+
+@dataclass
+class Escalation:
+    """best: the candidate so far. groups: the photos of each camera (see `features`). fixed: intrinsics are kept.
+    more: THOROUGH features. known: models of these. support: of the best by the matches of `more`."""
+
+    best: Candidate
+    groups: list[Group]
+    fixed: bool
+    options: ReadOptions
+    more: FeatureStore | None = None
+    known: list[Any] = field(default_factory=list)
+    support: int = 0
+    trusted: bool = False
+    """Whether the matches of `more` contradict no photo of the models at once."""
+
+    def run(self) -> tuple[Candidate, list[dict[str, Any]]]:
+        """The best candidate; of each step its name, the photos registered after it, and seconds."""
+        names, few = self.best.store.names, len(self.best.store.names) <= REPEATABLE_PHOTOS
+        steps: list[dict[str, Any]] = [{"step": "at once", "registered": len(self.best.registered)}]
+        tries = {"more features": self._grow, **({"mapping anew": self._anew} if few else {})}
+        tries |= {"joining models": self._join, "guided matching": self._guide}
+        tries |= {"global mapping": self._global} if few else {}
+        for name, attempt in tries.items():
+            registered, started = len(self.best.registered), time.perf_counter()
+            if registered == len(names) or (self.more is not None and not self._linked(self.more)):
+                break
+            self.options.progress.log(f"poses: {registered} of {len(names)} photos registered; {name} is next")
+            self.more = self.more or self._more_features()
+            found = attempt(self.more)
+            if found is not None and self._is_better(found):
+                self.best, self.support = found, found.support
+            spent = time.perf_counter() - started
+            steps.append({"step": name, "registered": len(self.best.registered), "seconds": spent})
+        return self.best, steps
+
+    def _is_better(self, found: Candidate) -> bool:
+        more = len(found.registered) - len(self.best.registered)
+        if found.folded or self.best.folded:
+            return more >= 0 and not found.folded
+        return more > 0 and found.support >= self.support and not (self.trusted and self._doubtful(found))
+
+    def _doubtful(self, found: Candidate) -> bool:
+        """Whether photos of the best lie elsewhere, or many pairs of one of them and a new one contradict the model."""
+        both = sorted(self.best.registered & found.registered)
+        if len(both) < MIN_MODEL_SIZE:
+            return True
+        had, now = (np.stack([c.models[0].images[i].projection_center() for i in both]) for c in (self.best, found))
+        scale, turn, shift = align_similarity(had, now)
+        moved = np.linalg.norm(scale * now @ turn.T + shift - had, axis=1)
+        if np.median(moved) > MOVED * np.linalg.norm(had - had.mean(axis=0), axis=1).mean():
+            return True
+        pairs = verified_pairs(found.models[0], found.store.database)
+        across = [pair.agrees for pair in pairs if len({pair.i, pair.j} & self.best.registered) == 1]
+        return across.count(False) * DOUBT > len(across)
+
+    def _linked(self, store: FeatureStore) -> dict[tuple[int, int], int]:
+        """Verified matches of the pairs of photos, by image ids, that are not in one model."""
+        done = [set(model.reg_image_ids()) for model in self.best.models]
+        verified = verified_matches(store.database).items()
+        return {
+            pair: len(found) for pair, found in verified if len(found) and not any(each >= set(pair) for each in done)
+        }
+
+    # ------------------------------------------------------------------ steps
+
+    def _grow(self, store: FeatureStore) -> Candidate | None:
+        """The models so far, with the points of more features, and photos added."""
+        if self.best.folded or not self.best.models:
+            return None
+        start = self._adjusted(self.best.models[:1], store)
+        self.support = Candidate([start], set(), store).support
+        self.trusted = consistent_photos(verified_pairs(start, store.database)) == self.best.registered
+        grown = [self._grown(start, store)]
+        grown += [self._grown(self._adjusted([model], store), store) for model in self.best.models[1:]]
+        return max(grown, key=lambda each: len(each.registered))
+
+    def _anew(self, store: FeatureStore) -> Candidate | None:
+        found = []
+        for models, out in candidates(store, self.fixed, self.options.seed, self.options.progress, most=CANDIDATES):
+            found.append(self._checked(models, out, store))
+            if found[-1].registered == set(models[0].reg_image_ids()) and not found[-1].folded:
+                break
+        return max(found, key=lambda each: (not each.folded, each.support), default=None)
+
+    def _join(self, store: FeatureStore) -> Candidate | None:
+        """One model of those that share photos."""
+        groups = merge.align(merge.without_repeats(self.known), self.options.seed)
+        return self._grown(self._adjusted(groups[0], store), store) if groups and len(groups[0]) > 1 else None
+
+    def _guide(self, store: FeatureStore) -> Candidate | None:
+        """The best model, with more matches of the photos that are left out and their best partners."""
+        if not self.best.models:
+            return None
+        folder, linked = store.folder / "guided", self._linked(store)
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        guided = FeatureStore(folder, store.image_root, store.names, store.facts, THOROUGH)
+        shutil.copyfile(store.database, guided.database)
+        pairs = set[tuple[int, int]]()
+        for image in {image for pair in linked for image in pair} - self.best.registered:
+            mine = [pair for pair in linked if image in pair]
+            pairs |= set(sorted(mine, key=lambda pair: (-linked[pair], pair))[:GUIDED])
+        with load_pycolmap().Database.open(guided.database) as db:
+            names = {image.image_id: image.name for image in db.read_all_images()}
+            for pair in pairs:
+                db.delete_matches(*pair)
+                db.delete_two_view_geometry(*pair)
+        chosen = [(names[one], names[other]) for one, other in sorted(pairs)]
+        match(guided.database, chosen, self.options.seed, self.options.progress, THOROUGH, guided=True)
+        return self._grown(self._adjusted(self.best.models[:1], guided), guided)
+
+    def _global(self, store: FeatureStore) -> Candidate | None:
+        pycolmap = load_pycolmap()
+        options = pycolmap.GlobalPipelineOptions()
+        options.random_seed, options.num_threads = self.options.seed, 1
+        options.mapper.global_positioning.use_gpu = options.mapper.bundle_adjustment.ceres.use_gpu = False
+        with TemporaryDirectory(dir=store.folder) as out:
+            found = pycolmap.global_mapping(store.database, store.image_root, out, options).values()
+        largest = max(found, key=lambda model: model.num_reg_images(), default=None)
+        return self._grown(self._adjusted([largest], store), store) if largest is not None else None
+
+    # ----------------------------------------------------------------- models
+
+    def _adjusted(self, models: list[Any], store: FeatureStore) -> Any:
+        """One model of aligned ones, adjusted to all matches of the store."""
+        options = pipeline_options(self.fixed, self.options.seed, one_thread=True, effort=store.effort)
+        return merge.adjusted(merge.merged(models), store, options, add=False)
+
+    def _grown(self, start: Any, store: FeatureStore, again: bool = True) -> Candidate:
+        """`start` with photos added."""
+        seed, count, progress = self.options.seed, len(store.names), self.options.progress
+        found = map_photos(store, self.fixed, seed, count, progress, one_thread=True, start=start)
+        return self._checked(*found, store, again)
+
+    def _checked(self, models: list[Any], contradicted: set[str], store: FeatureStore, again: bool = True) -> Candidate:
+        """Without photos that matches contradict or few others hold; where there are such, the rest is adjusted anew.
+        again: then photos are added once more, as the wrong ones may have been in the way."""
+        best, complete = models[0], models[0].num_reg_images()
+        while (wrong := _contradicted(best, store)) | (loose := _loose(best)):
+            contradicted = contradicted | {best.images[image].name for image in wrong}
+            take_out(best, wrong | loose)
+            if best.num_reg_images() < MIN_MODEL_SIZE:
+                return Candidate([], contradicted, store)
+            best = self._adjusted([best], store)
+        self.known += [best, *models[1:]]
+        had, largest = set(best.reg_image_ids()), best.num_reg_images()
+        new = {
+            model: len(set(model.reg_image_ids()) - had) for model in models[1:] if model.num_reg_images() <= largest
+        }
+        kept = Candidate([best, *(each for each in new if new[each] >= MIN_MODEL_SIZE)], contradicted, store)
+        if not again or largest == complete:
+            return kept
+        grown = self._grown(self._adjusted([best], store), store, again=False)
+        return grown if grown.registered > kept.registered and grown.support > kept.support else kept
+
+    # --------------------------------------------------------------- features
+
+    def _more_features(self) -> FeatureStore:
+        """THOROUGH features of the photos left out and of those similar to them; those left out are matched with all
+        others, and every verified pair of photos with new features again."""
+        store, progress = self.best.store, self.options.progress
+        names, folder = store.names, store.folder / MORE
+        recover(folder)
+        if not folder.is_dir():
+            with load_pycolmap().Database.open(store.database) as db:
+                ids = [db.read_image_with_name(name).image_id for name in names]
+            done = set() if self.best.folded else self.best.registered
+            left = [row for row, image in enumerate(ids) if image not in done]
+            similar = similar_photos(largest_features(store.database, names))
+            again = np.asarray(similar[left].any(axis=0))
+            again[left] = True
+            row = {image: n for n, image in enumerate(ids)}
+            pairs = {(row[i], row[j]) for (i, j), found in verified_matches(store.database).items() if len(found)}
+            pairs = {pair for pair in pairs if again[list(pair)].any()}
+            possible = similar if len(names) > ALL_PAIRS else np.ones_like(similar)
+            pairs |= {(i, j) for i in left for j in np.flatnonzero(possible[i]).tolist() if i != j}
+            chosen = sorted({(min(pair), max(pair)) for pair in pairs})
+            with atomic_directory(folder) as new:
+                database, kept = new / store.database.name, [image for image, n in row.items() if not again[n]]
+                write_part(store.database, kept, database, matched=True)
+                wanted = {name for name, n in zip(names, again, strict=True) if n}
+                groups = [([name for name in group if name in wanted], reader) for group, reader in self.groups]
+                extract(database, store.image_root, [each for each in groups if each[0]], progress, THOROUGH)
+                match(database, [(names[i], names[j]) for i, j in chosen], self.options.seed, progress, THOROUGH)
+        facts = {**store.facts, "pairs_matched": len(verified_matches(folder / store.database.name))}
+        return FeatureStore(folder, store.image_root, names, facts, THOROUGH)
+
+
+def _contradicted(model: Any, store: FeatureStore) -> set[int]:
+    """Photos of a model that the matches of others contradict."""
+    return set(model.reg_image_ids()) - consistent_photos(verified_pairs(model, store.database))
+
+
+def _loose(model: Any) -> set[int]:
+    """Photos of a model that share less than SHARED points with two others."""
+    tracks = [point.track.elements for point in model.points3D.values() if point.track.length() > 2]
+    shared = Counter(element.image_id for track in tracks for element in track)
+    return {image for image in model.reg_image_ids() if shared[image] < SHARED}
