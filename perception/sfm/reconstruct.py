@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from perception.photos.decode import photo_size
 from perception.photos.folder import PhotoSet, choose_photos
 from perception.photos.ignore_masks import mask_of
 from perception.photos.lens import lens_from_camera, lens_text, load_pycolmap
+from perception.photos.still import with_still
 from perception.sfm.consistency import model_warnings
 from perception.sfm.database import FeatureStore, build_features, verified_matches
 from perception.sfm.incremental import REPEATABLE_PHOTOS, map_photos
@@ -44,15 +46,19 @@ def reconstruct(folder: Path, options: ReadOptions) -> Scene:
         if lens and photo_size(photo) != (lens.width, lens.height):
             found = "×".join(map(str, photo_size(photo)))
             raise InputError(f"{photo}: the photo is {found}, the camera file says {lens.width}×{lens.height}")
-    ignored = [mask_of(options.masks, name) for name in chosen.names]
-    store = build_features(photos, [lens] * len(photos), options, ignored)
+    own = [mask_of(options.masks, name) for name in chosen.names]
+    still = with_still(photos, list(map(photo_size, photos)), own, options.still_folder(own), options.progress)
+    store = build_features(photos, [lens] * len(photos), options, still.masks)
     model, report = _map(store, chosen, folder, options)
     staged = dict(zip(store.names, zip(chosen.names, photos, strict=True), strict=True))
     located = {image_id: staged[model.images[image_id].name] for image_id in model.reg_image_ids()}
     views, facts = views_of_model(model, located, folder, options)
+    masks = dict(zip(chosen.names, still.masks, strict=True))
+    views = [replace(view, mask=masks[view.name]) for view in views]
     points, colors = cloud_of(model)
     report["left_out"] = sorted([*chosen.left_out, *report["left_out"]], key=lambda entry: entry["name"])
-    return Scene(views, points, colors, report={**report, "exposure": facts["exposure"], "notes": chosen.notes})
+    report |= {"exposure": facts["exposure"], "notes": chosen.notes}
+    return Scene(views, points, colors, report=report | still.added_to(report))
 
 
 def _too_few(folder: Path, chosen: PhotoSet) -> InputError:
