@@ -48,6 +48,9 @@ class PhotoConfig(Settings):
     held_out: str | None = Field(None, description="text file of the photos kept for scoring instead, a name a line")
     camera: str | None = Field(None, description="ROS camera_info YAML: the intrinsics of all photos, kept fixed")
     ignore_masks: str | None = Field(None, description="folder of PNG masks, same stem as the photo: black is ignored")
+    ignore_still: bool = Field(
+        True, description="ignore what stays in the picture while the camera moves: a gripper, a bumper, dirt, a date"
+    )
     init_points: str | None = Field(None, description="cloud in the frame of the input's poses to start training from")
     poses: Literal["auto", "keep", "refine"] = Field(
         "auto", description="given poses: refined where matched features show that they are wrong, kept, or refined"

@@ -13,12 +13,15 @@ from perception.errors import InputError
 REPORT = "report.html"
 FACTS = "map.json"
 STORE = "store.json"
+IGNORED = "ignored.png"
+"""The mask of what stays in the photos and is ignored, as in map.json, for people to look at."""
 """In the folder of a store of many maps, the list of its maps."""
 EDITABLE = "instances.json"
 """Users may edit labels in this file by hand, so a changed checksum is reported and not an error."""
 DATA = (
     *("gaussians.ply", "features.npy", "instance_ids.npy", "membership.npy"),
     *("cameras.npz", "index.npz", "language.npz", "parts.npz", "groups.npz"),
+    IGNORED,
 )
 """Names of a map's other files, in all format versions."""
 _UNFINISHED = re.compile(r"^\.(.+)\.new-\d+-\w{8}$")

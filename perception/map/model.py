@@ -8,7 +8,7 @@ import json
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import Base64Bytes, Field
 
 from perception.io.json_shapes import (
     Bytes,
@@ -56,7 +56,7 @@ FACTS = typed({
     },
     "scene?": {
         "origin?": Point, "input?": PathText, "left_out?": [{"name": PathText, "why": PathText}],
-        "warnings?": list[PathText],
+        "warnings?": list[PathText], "still?": {"photos": Count, "share": Share, "mask": Base64Bytes},
     },
     "masks?": {"warnings?": list[PathText]},
     "instances?": {"texts?": Any},

@@ -10,6 +10,7 @@ groups.npz      instances that may be one thing: of [I] int32, group of each ins
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import json
 import math
@@ -24,7 +25,7 @@ from perception.errors import InputError
 from perception.io.atomic import atomic_file
 from perception.io.documents import safe_name
 from perception.io.ply import write_ply
-from perception.map.checksums import EDITABLE, FACTS, REPORT, facts_of, listed_files, seal, verify
+from perception.map.checksums import EDITABLE, FACTS, IGNORED, REPORT, facts_of, listed_files, seal, verify
 from perception.map.files import FORMAT_VERSION, MapFiles
 from perception.map.map import Map
 from perception.map.replace import map_directory, writing
@@ -61,6 +62,8 @@ def write_map(path: Path, gmap: Map, keep_report: bool = False, fresh: bool = Fa
         for name, arrays in (("parts", gmap.parts), ("groups", gmap.groups)):
             if arrays:
                 np.savez_compressed(folder / f"{name}.npz", **arrays)  # type: ignore[arg-type]
+        if still := info.get("scene", {}).get("still"):
+            (folder / IGNORED).write_bytes(base64.b64decode(still["mask"]))
         _dump(folder / EDITABLE, {"instances": gmap.instances})
         if keep_report and (path / REPORT).is_file():
             shutil.copy2(path / REPORT, folder / REPORT)

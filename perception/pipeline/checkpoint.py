@@ -2,8 +2,8 @@
 repeats only what has changed.
 
     stage      depends on                                                 kept in the work folder as
-    poses      input, photos.camera, strict, poses, ignore_masks and
-               init_points, frame.*, seed                                 poses-MARK/
+    poses      input, photos.camera, strict, poses, ignore_masks,
+               ignore_still and init_points, frame.*, seed                              poses-MARK/
     masks      source of masks, photo, size (and the map's depth)         masks/, a key in each PNG
     optimise   poses, photos.*, train.*, densify.*, losses.*; and masks   before_masks.pt, checkpoint.pt
     group      optimise, instances.*                                      nothing: it takes seconds
@@ -59,6 +59,7 @@ def poses_mark(source: Path, config: MapConfig) -> str:
     """Hash of the input path and the settings that change the poses and the sparse cloud."""
     photos = config.photos
     chosen = (photos.camera, photos.strict, photos.poses, photos.ignore_masks, photos.init_points)
+    chosen = (*chosen, photos.ignore_still)
     return digest(os.path.realpath(source), *chosen, config.frame.model_dump(), config.seed)
 
 

@@ -136,6 +136,7 @@ def _posed_scene(output: Path, run: Run) -> Scene:
             masks, camera, cloud = (Path(file) if file else None for file in files)
             options = ReadOptions(work / "sfm", config.seed, progress, photos.strict, masks, camera)
             options = replace(options, frames=frames_folder(output), init_points=cloud, poses=photos.poses)
+            options = replace(options, still=photos.ignore_still)
             scene = load_scene(source, replace(options, engine=run.engine))
             save_scene(kept, scene := in_world_frame(recentred(scene), config.frame, config.seed))
         if config.losses.depth_weight == 0:

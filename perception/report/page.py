@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image
 
 from perception.colors import instance_palette
 from perception.config import flat
@@ -94,8 +95,6 @@ def write_page(path: Path, data: Mapping[str, Any]) -> Path:
 
 def _image(picture: np.ndarray, side: int, quality: int) -> tuple[int, int, str]:
     """(width, height, data URI) of an image [H, W, 3] uint8, with a longer side of at most `side` pixels."""
-    from PIL import Image
-
     image = Image.fromarray(np.ascontiguousarray(picture[..., :3], np.uint8))
     image.thumbnail((side, side), Image.Resampling.LANCZOS)
     buffer = io.BytesIO()
@@ -244,12 +243,15 @@ def _view_rows(album: _Album) -> list[dict[str, np.ndarray]]:
 
 def _overview(gmap: Map, album: _Album) -> dict[str, np.ndarray]:
     """Instances and features of the middle photo of the sequence."""
-    names = list(album.views)
+    names, still = list(album.views), gmap.info.get("scene", {}).get("still")
     name = names[len(names) // 2] if names else ""
-    photo = album.photo(name)
+    photo, shown = album.photo(name), {}
+    if still:
+        mask = Image.open(io.BytesIO(base64.b64decode(still["mask"]))).convert("RGB")
+        shown[f"black: stays in the picture and is ignored, {still['share']:.1%}"] = np.asarray(mask)
     if photo is None or not gmap.instances:
-        return {}
-    return {
+        return shown
+    return shown | {
         f"instances in {name}": overlay(photo, album.ids(name)),
         "instance features (main components)": album.features(name),
     }

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from perception.map.checksums import IGNORED
 from perception.query import Hit, QueryMap
 
 
@@ -54,6 +55,9 @@ def info_text(path: Path, info: dict[str, Any], texts: dict[int, list[dict[str, 
         f"harmonics of degree {info['sh_degree']}; peak memory {info.get('peak_memory_mib')} MiB",
     ]
     lines += frame_lines(info)
+    if still := scene.get("still"):
+        what = f"{still['share']:.1%} of the pixels of {still['photos']} photos"
+        lines.append(f"ignored, as it stays in the picture while the camera moves: {what} ({path / IGNORED})")
     if training.get("profile"):
         lines.append("of training: " + ", ".join(f"{name} {share:.0%}" for name, share in shares(training).items()))
     if depth := info.get("depth"):

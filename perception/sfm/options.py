@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -26,6 +27,7 @@ class ReadOptions:
     of a video (None: workdir/frames), which the map needs later. init_points: cloud in the frame of the input's poses,
     used instead of sparse points. poses: "keep", "refine", or "auto": checked where features are matched anyway or
     views have depth, and refined where they are wrong (see sfm.pose_refinement). engine: where features are made.
+    still: what stays in the picture while the camera moves is ignored (see `photos.still`).
     lens, cloud: what `load_scene` reads from `camera` and `init_points`.
     """
 
@@ -41,3 +43,9 @@ class ReadOptions:
     engine: Engine = field(default_factory=Engine)
     lens: Lens | None = None
     cloud: Cloud | None = None
+    still: bool = True
+
+    def still_folder(self, masks: Sequence[Path | None]) -> Path | None:
+        """Folder for masks of what stays in the picture; None where it is used. masks: of all photos; a folder `masks`
+        without any of them is refused later."""
+        return self.workdir / "still" if self.still and (self.masks is None or any(masks)) else None

@@ -22,6 +22,9 @@ LEAST_MATCHES = 100
 IMPROVED, HOPELESS = 0.8, 3.0
 """Refined poses are used only if their error is at most this share of that of the given poses, and at most this many
 times the tolerance."""
+PARTS, LEAST_OF_PART, AGREED = 4, 20, 0.75
+"""Refined poses are used only if the error falls to IMPROVED in the share AGREED of the PARTS × PARTS parts of the
+picture that have LEAST_OF_PART features. A thing that moves with the camera drags the poses, but fits only its part."""
 UNIT = 1.5
 """Depth is left out if the median ratio of triangulated to measured depth is farther from 1 than this factor."""
 
@@ -71,9 +74,14 @@ def checked_poses(views: list[View], features: Features, mode: str) -> tuple[lis
     if mode == "auto" and before["epipolar"] <= good:
         return usable, report
     refined = refine(features, given)
-    after = _medians(features, refined)
-    if after["epipolar"] <= min(IMPROVED * before["epipolar"], HOPELESS * good):
-        changes, text = _changes(refined.since(given))
+    after, (changes, text) = _medians(features, refined), _changes(refined.since(given))
+    better = after["epipolar"] <= min(IMPROVED * before["epipolar"], HOPELESS * good)
+    agreed, parts = _parts_improved(features, given, refined)
+    if better and agreed < AGREED * parts:
+        where = f"lowers their error only in {agreed} of {parts} parts of the picture"
+        warnings.append(f"refining the given poses {where}, and {text}; they are used as they are")
+        return usable, report
+    if better:
         facts |= {"refined": True, "error_px": after, **changes}
         notes.append(f"refined poses: {_text(after)}; {text}")
         return [replace(v, camera_from_world=m) for v, m in zip(usable, refined.matrices(), strict=True)], report
@@ -136,6 +144,17 @@ def _medians(features: Features, poses: Poses) -> dict[str, float]:
     lines, carried = match_errors(features, poses)
     known = carried[np.isfinite(carried)]
     return {"epipolar": float(np.median(lines)), **({"by_depth": float(np.median(known))} if len(known) else {})}
+
+
+def _parts_improved(features: Features, given: Poses, refined: Poses) -> tuple[int, int]:
+    """Number of the parts of the picture in which the median error falls to IMPROVED, and of all that have features."""
+    before, after = (match_errors(features, poses)[0] for poses in (given, refined))
+    rays = features.rays[features.pairs.T.ravel()]
+    low, high = np.quantile(rays, (0.01, 0.99), axis=0)
+    column, row = np.clip((rays - low) / np.maximum(high - low, 1e-9) * PARTS, 0, PARTS - 1).astype(int).T
+    in_parts = [np.flatnonzero(row * PARTS + column == part) for part in range(PARTS**2)]
+    ratios = [np.median(after[i]) / max(np.median(before[i]), 1e-9) for i in in_parts if len(i) >= LEAST_OF_PART]
+    return sum(ratio <= IMPROVED for ratio in ratios), len(ratios)
 
 
 def _text(errors: dict[str, float]) -> str:

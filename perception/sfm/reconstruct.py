@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import shutil
 import time
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from perception.photos.decode import photo_size
 from perception.photos.folder import PhotoSet, choose_photos
 from perception.photos.ignore_masks import mask_of
 from perception.photos.lens import lens_from_camera, lens_text, load_pycolmap
+from perception.photos.still import with_still
 from perception.sfm.consistency import model_warnings
 from perception.sfm.database import FeatureStore, build_features, verified_matches
 from perception.sfm.escalation import MORE, Candidate, Escalation
@@ -50,16 +52,20 @@ def reconstruct(folder: Path, options: ReadOptions) -> Scene:
         if lens and photo_size(photo) != (lens.width, lens.height):
             found = "×".join(map(str, photo_size(photo)))
             raise InputError(f"{photo}: the photo is {found}, the camera file says {lens.width}×{lens.height}")
-    ignored = [mask_of(options.masks, name) for name in chosen.names]
-    store = build_features(photos, [lens] * len(photos), options, ignored)
+    own = [mask_of(options.masks, name) for name in chosen.names]
+    still = with_still(photos, list(map(photo_size, photos)), own, options.still_folder(own), options.progress)
+    store = build_features(photos, [lens] * len(photos), options, still.masks)
     model, report = _map(store, chosen, folder, options)
     staged = dict(zip(store.names, zip(chosen.names, photos, strict=True), strict=True))
     located = {image_id: staged[model.images[image_id].name] for image_id in model.reg_image_ids()}
     views, facts = views_of_model(model, located, folder, options)
+    masks = dict(zip(chosen.names, still.masks, strict=True))
+    views = [replace(view, mask=masks[view.name]) for view in views]
     points, colors = cloud_of(model)
     report["left_out"] = sorted([*chosen.left_out, *report["left_out"]], key=lambda entry: entry["name"])
     notes = [*chosen.notes, *_brought(report.get("steps", []), len(photos))]
-    return Scene(views, points, colors, report={**report, "exposure": facts["exposure"], "notes": notes})
+    report |= {"exposure": facts["exposure"], "notes": notes}
+    return Scene(views, points, colors, report=report | still.added_to(report))
 
 
 def _too_few(folder: Path, chosen: PhotoSet) -> InputError:

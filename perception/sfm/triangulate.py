@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from perception.geometry import inverse_se3
 from perception.photos.lens import camera_from_lens, lens_text, load_pycolmap
+from perception.photos.still import with_still
 from perception.photos.views import view_lens
 from perception.sfm.database import FeatureStore, build_features
 from perception.sfm.exposure import with_gains
@@ -28,14 +30,17 @@ def posed_scene(views: list[View], cloud: Cloud, facts: dict[str, Any], options:
     With fewer than `least` points, triangulated points are used instead. facts: report entries, with "warnings"."""
     cameras = sorted({lens_text(view_lens(view)) for view in views})
     report = {**facts, "registered": len(views), "cameras": cameras, "seconds": {}}
+    photos, sizes, own = map(list, zip(*((view.photo, view.photo_size, view.mask) for view in views), strict=True))
+    still = with_still(photos, sizes, own, options.still_folder(own), options.progress)
+    views = [replace(view, mask=mask) for view, mask in zip(views, still.masks, strict=True)]
+    report |= still.added_to(report)
     points, colors = cloud
     few = len(points) < least
     doubted = options.poses == "auto" and (few or any(view.depth is not None for view in views))
     check = doubted or options.poses == "refine"
     if few or check:
-        photos, lenses, masks = zip(*((view.photo, view_lens(view), view.mask) for view in views), strict=True)
-        as_stored = [view.as_stored for view in views]
-        store = build_features(list(photos), list(lenses), options, list(masks), posed=True, as_stored=as_stored)
+        as_stored, lenses = [view.as_stored for view in views], list(map(view_lens, views))
+        store = build_features(photos, lenses, options, still.masks, posed=True, as_stored=as_stored)
         report["seconds"] = store.facts["seconds"]
         features = features_of(views, store)
         if check:
