@@ -14,8 +14,8 @@ import torch
 
 from perception.errors import InputError
 from perception.frame.recentre import map_from_input, moved
-from perception.gaussians.model import Gaussians
-from perception.gaussians.views import depth_image, render
+from perception.gaussians.model import Gaussians, as_gaussians
+from perception.gaussians.views import depth_image, render, rgb_image
 from perception.inputs.transforms import read_frames
 from perception.instances.silhouettes import render_silhouettes
 from perception.io.atomic import atomic_file
@@ -78,12 +78,6 @@ def _listed(cameras: Path | None) -> list[Path]:
     return [cameras, *photos, *(photo.with_name(f"{photo.name}.png") for photo in photos)]
 
 
-def as_gaussians(gmap: Map) -> Gaussians:
-    """A map's Gaussians as tensors."""
-    names = ("means", "quats", "log_scales", "opacity_logits", "sh", "features")
-    return Gaussians(**{name: torch.from_numpy(np.ascontiguousarray(getattr(gmap, name))) for name in names})
-
-
 def rendered_crop(gmap: QueryMap, instance_id: int, side: int) -> np.ndarray | None:
     """`query.crops.best_crop` of the map's own picture in place of the photo."""
     found = gmap.best_view(instance_id)
@@ -139,11 +133,11 @@ def _picture(kind: str, gaussians: Gaussians, gmap: Map, view: View) -> np.ndarr
     if kind == "depth":
         depth = depth_image(gaussians, pose, K, view.width, view.height)
         return (depth * 1000).round().clamp(0, 65535).numpy().astype(np.uint16)
-    features = gaussians.features if kind == "features" else None
-    out = render(gaussians, pose, K, view.width, view.height, harmonics=True, features=features)
-    if out.features is not None:
-        return features_to_rgb(out.features[0].numpy())
-    return (out.colors[0].clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
+    if kind == "rgb":
+        return rgb_image(gaussians, pose, K, view.width, view.height)
+    out = render(gaussians, pose, K, view.width, view.height, features=gaussians.features)
+    assert out.features is not None  # for the type checker
+    return features_to_rgb(out.features[0].numpy())
 
 
 def write_picture(path: Path, image: np.ndarray) -> None:
