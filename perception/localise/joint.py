@@ -9,6 +9,7 @@ import numpy as np
 from perception.localise.keypoints import Described, triangulated
 from perception.localise.reference import Reference
 from perception.sfm.bundle_adjustment import Poses, adjust, residuals
+from perception.sfm.consistency import Pair, stronger_contradictions
 from perception.sfm.pose_refinement import match_errors
 from perception.sfm.tracks import Features, grouped, observed
 
@@ -48,9 +49,9 @@ def adjusted(
     old, count = reference.described.features, len(reference.views)
     poses = _with(reference.poses, placed, len(new.starts) - 1)
     inside = np.isin(new.features.view, list(placed))
-    between = new.features.pairs[inside[new.features.pairs].all(axis=1)]
+    between = inside[new.features.pairs].all(axis=1) & _agreeing(new, poses, count, most)
     shift = len(old.view)
-    pairs = np.concatenate([old.pairs, links[inside[links[:, 0]]] + (shift, 0), between + shift])
+    pairs = np.concatenate([old.pairs, links[inside[links[:, 0]]] + (shift, 0), new.features.pairs[between] + shift])
     features = joined(reference, new.features, pairs)
     rows, point = grouped(features, pairs)
     seen = np.bincount(point, features.view[rows] >= count, point.max(initial=-1) + 1) > 0
@@ -78,23 +79,23 @@ def adjusted(
     return Adjustment(poses, owner, found.points if numbers else points, covariance, inliers, rms)
 
 
-def outvoted(reference: Reference, new: Described, found: Adjustment, placed: set[int], most: float) -> int | None:
-    """The placed photo that most disagrees with the others by the matches between them: more of these contradict the
-    poses than agree. None if there is none."""
-    features = new.features
-    pairs = features.pairs[np.isin(features.view[features.pairs], list(placed)).all(axis=1)]
-    if not len(pairs):
-        return None
-    count = len(reference.views)
-    own = Poses(found.poses.rotation[count:], found.poses.center[count:])
-    lines, _ = match_errors(replace(features, pairs=pairs), own)
-    good = (lines.reshape(2, -1) <= most).all(axis=0)
-    views, size = features.view[pairs].ravel(), len(new.starts) - 1
-    agreeing = np.bincount(views, np.repeat(good, 2), size)
-    share = agreeing / np.maximum(np.bincount(views, minlength=size), 1)
-    share[np.bincount(views, minlength=size) == 0] = 1
-    worst = int(share.argmin())
-    return worst if share[worst] < 0.5 else None
+def contradicted(reference: Reference, new: Described, found: Adjustment, placed: set[int], most: float) -> int | None:
+    """The placed photo whose pose rests on fewest features, of two whose matches contradict their poses and are more
+    than those that the poses rest on (see `sfm.consistency`): a texture or thing that is elsewhere now. None if there
+    is none."""
+    views, good = new.features.view[new.features.pairs], _agreeing(new, found.poses, len(reference.views), most)
+    pairs = [Pair(-1, number, found.inliers[number], 1.0) for number in sorted(placed)]
+    for i, j in np.unique(views[np.isin(views, list(placed)).all(axis=1)], axis=0).tolist():
+        between = (views == (i, j)).all(axis=1)
+        pairs.append(Pair(i, j, int(between.sum()), float(good[between].mean())))
+    wrong = {number for pair in stronger_contradictions(pairs) for number in (pair.i, pair.j)}
+    return min(wrong, key=lambda number: (found.inliers[number], number), default=None)
+
+
+def _agreeing(new: Described, poses: Poses, count: int, most: float) -> np.ndarray:
+    """[M] whether the matches between new photos agree with their poses, which follow `count` of the map."""
+    lines, _ = match_errors(new.features, Poses(poses.rotation[count:], poses.center[count:]))
+    return np.asarray((lines.reshape(2, -1) <= most).all(axis=0))
 
 
 def _with(poses: Poses, placed: dict[int, np.ndarray], count: int) -> Poses:

@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from perception.errors import InputError
-from perception.localise.joint import Adjustment, adjusted, outvoted
+from perception.localise.joint import Adjustment, adjusted, contradicted
 from perception.localise.keypoints import described, tolerance
 from perception.localise.pose import MIN_INLIERS, Matched, find_pose
 from perception.localise.reference import Locate, Reference, open_reference
@@ -62,6 +62,11 @@ class Localised:
     covariance: np.ndarray
     inliers: int
     rms_px: float
+
+    @property
+    def position(self) -> np.ndarray:
+        """[3] of the camera in the map's frame."""
+        return np.asarray(-self.camera_from_map[:3, :3].T @ self.camera_from_map[:3, 3])
 
     @property
     def standard_error(self) -> tuple[float, float]:
@@ -150,7 +155,7 @@ class _Search:
         while self.placed:
             found = adjusted(self.reference, self.new, self.placed, self._all_links(), self.most)
             self._take(found)
-            wrong = outvoted(self.reference, self.new, found, set(self.placed), self.most)
+            wrong = contradicted(self.reference, self.new, found, set(self.placed), self.most)
             if wrong is not None:
                 self._drop(wrong, "its matches with the other new photos contradict its pose")
             elif not self._reach(found, candidates):
