@@ -18,7 +18,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.localise.joint import Adjustment, adjusted, contradicted
 from perception.localise.keypoints import described, tolerance
-from perception.localise.pose import MIN_INLIERS, Matched, find_pose
+from perception.localise.pose import GUESSED, KNOWN, LIKELY, MIN_INLIERS, Matched, find_pose
 from perception.localise.reference import Locate, Reference, open_reference
 from perception.map.map import Map
 from perception.photos.decode import photo_size, why_left_out
@@ -30,7 +30,7 @@ from perception.sfm.options import ReadOptions
 from perception.sfm.tracks import features_of
 from perception.types import DepthImage, Lens, View
 
-LIKELY, MORE = 10, 60
+ALIKE, MORE = 10, 60
 """Photos of the map that a new photo is matched with: the most alike, and if they give no pose, so many more."""
 SAME_FOCAL = 0.15
 """Largest relative difference of a photo's focal length in EXIF from that of the map's camera of the same size, for the
@@ -122,35 +122,41 @@ class Localiser:
         """As `localise`, with the reason for each photo that has no pose; one that cannot be read is among these."""
         unread = {n: why for n, p in enumerate(photos) if (why := why_left_out(p.photo)) is not None}
         usable = [n for n in range(len(photos)) if n not in unread]
-        found = _Search(self._reference, [photos[n] for n in usable], self._progress).run() if usable else []
+        with TemporaryDirectory(prefix="perception-localise-") as folder:
+            chosen = [photos[n] for n in usable]
+            found = _Search(self._reference, chosen, Path(folder), self._progress).run() if usable else []
         done = dict(zip(usable, found, strict=True))
         return [done[n] if n in done else NotHere(p.name, p.photo, unread[n]) for n, p in enumerate(photos)]
 
 
 class _Search:
-    """One call: some photos, all readable."""
+    """One call: some photos, all readable. folder: for their features."""
 
-    def __init__(self, reference: Reference, photos: list[NewPhoto], progress: Progress) -> None:
+    def __init__(self, reference: Reference, photos: list[NewPhoto], folder: Path, progress: Progress) -> None:
         self.reference, self.photos, self.progress = reference, photos, progress
-        lenses = [_lens_of(photo, reference.views) for photo in photos]
-        with TemporaryDirectory(prefix="perception-localise-") as folder:
-            options = ReadOptions(Path(folder), progress=progress)
-            paths = [photo.photo for photo in photos]
-            self.store = build_features(paths, [lens for lens, _ in lenses], options)
-            self.views = [_view(photo, lens) for photo, (lens, _) in zip(photos, lenses, strict=True)]
-            self.new = described(features_of(self.views, self.store), self.store)
-        self.known = [known for _, known in lenses]
+        lenses, self.trust = zip(*(_lens_of(photo, reference.views) for photo in photos), strict=True)
+        paths, options = [photo.photo for photo in photos], ReadOptions(folder, progress=progress)
+        self.store = build_features(paths, list(lenses), options)
+        self._see(lenses)
         self.most = tolerance(max(max(view.photo_size) for view in self.views))
         self.placed: dict[int, np.ndarray] = {}
         self.links: dict[int, np.ndarray] = {}
+        self.lenses: dict[int, Lens] = {}
         self.why: dict[int, str] = {}
         self.dropped = Counter[int]()
 
+    def _see(self, lenses: Sequence[Lens]) -> None:
+        """Reads the features as seen through a lens for each photo."""
+        self.views = [_view(photo, lens) for photo, lens in zip(self.photos, lenses, strict=True)]
+        self.new = described(features_of(self.views, self.store), self.store)
+
     def run(self) -> list[Localised | NotHere]:
+        """The answer for each photo."""
         candidates = {}
         for number in range(len(self.photos)):
             candidates[number] = self._alone(number)
             self.progress.update("localise: photos", number + 1, len(self.photos))
+        self._share_lenses(candidates)
         found = None
         while self.placed:
             found = adjusted(self.reference, self.new, self.placed, self._all_links(), self.most)
@@ -162,12 +168,27 @@ class _Search:
                 break
         return [self._answer(number, found) for number in range(len(self.photos))]
 
+    def _share_lenses(self, candidates: dict[int, np.ndarray]) -> None:
+        """Photos with one assumed lens were taken by one camera: all get the estimate of median focal length."""
+        shared, lenses = dict[Lens, list[Lens]](), [view_lens(view) for view in self.views]
+        for number in sorted(self.placed):
+            shared.setdefault(lenses[number], []).append(self.lenses[number])
+        chosen = {lens: sorted(found, key=lambda each: each.params)[len(found) // 2] for lens, found in shared.items()}
+        if all(lens == found for lens, found in chosen.items()):
+            return
+        self._see([chosen.get(lens, lens) for lens in lenses])
+        self.trust = (KNOWN,) * len(lenses)
+        self.placed.clear()
+        self.links.clear()
+        for number, matches in candidates.items():
+            self._try(number, matches, self.reference.points[self.reference.point[matches[:, 1]]])
+
     def _alone(self, number: int) -> np.ndarray:
         """Places a photo by the map's photos alone; its matches [M, 2] with features of the map that have a point."""
         reference = self.reference
         order = np.argsort(-self.new.votes(number, reference.described), kind="stable")
         matches = np.empty((0, 2), np.int64)
-        for some in (order[:LIKELY], order[LIKELY : LIKELY + MORE]):
+        for some in (order[:ALIKE], order[ALIKE : ALIKE + MORE]):
             more = [self.new.matches(number, reference.described, view) for view in some.tolist()]
             matches = np.concatenate([matches, *more])
             matches = matches[reference.point[matches[:, 1]] >= 0]
@@ -179,11 +200,11 @@ class _Search:
     def _try(self, number: int, matches: np.ndarray, points: np.ndarray, others: int = 0) -> None:
         """Places a photo by matches [M, 2] with points [M, 3]; the last `others` are of other new photos."""
         matched = Matched(matches[:, 0], self.new.pixels[matches[:, 0]], points)
-        found = find_pose(matched, view_lens(self.views[number]), self.known[number])
+        found = find_pose(matched, view_lens(self.views[number]), self.trust[number])
         if isinstance(found, str):
             self.why[number] = found
             return
-        self.placed[number] = found.camera_from_map
+        self.placed[number], self.lenses[number] = found.camera_from_map, found.lens
         mine = matches[: len(matches) - others]
         self.links[number] = mine[found.inliers[: len(mine)]]
 
@@ -234,11 +255,11 @@ def _view(photo: NewPhoto, lens: Lens) -> View:
     return replace(make_view(photo.name, photo.photo, lens, np.eye(4), photo.photo), depth=photo.depth)
 
 
-def _lens_of(photo: NewPhoto, views: list[View]) -> tuple[Lens, bool]:
-    """The lens of a photo, and whether it is known: given; else the map's camera of the same shape, unless EXIF states
+def _lens_of(photo: NewPhoto, views: list[View]) -> tuple[Lens, float]:
+    """The lens of a photo, and how far it is trusted: given; else the map's camera of the same shape, unless EXIF has
     another focal length; else EXIF's or a usual one."""
     if photo.lens is not None:
-        return photo.lens, True
+        return photo.lens, KNOWN
     pycolmap = load_pycolmap()
     width, height = photo_size(photo.photo)
     exif = pycolmap.infer_camera_from_image(photo.photo)
@@ -249,8 +270,8 @@ def _lens_of(photo: NewPhoto, views: list[View]) -> tuple[Lens, bool]:
             lens = rescale_lens(lens, width, height)
             focal = camera_from_lens(lens).mean_focal_length()
             if not exif.has_prior_focal_length or abs(stated / focal - 1) <= SAME_FOCAL:
-                return lens, False
-    return Lens("SIMPLE_PINHOLE", (stated, width / 2, height / 2), width, height), False
+                return lens, LIKELY
+    return Lens("SIMPLE_RADIAL", (stated, width / 2, height / 2, 0.0), width, height), GUESSED
 
 
 def _finder(gmap: Map, folder: Path | None) -> Locate:

@@ -19,8 +19,8 @@ EQUAL = 0.7
 """A second pose with this share of the features of the first makes both doubtful: equal textures in two spots."""
 SAME_ANGLE, SAME_SHARE = 3.0, 0.05
 """Poses are the same if they differ by less than this angle in degrees and this share of the distance to the points."""
-GROWN = 1.15
-"""An assumed lens is replaced by an estimated one if that makes this many times as many features agree."""
+KNOWN, LIKELY, GUESSED = np.inf, 1.15, 1.0
+"""How far a lens is trusted: an estimated one replaces it if that makes this many times as many features agree."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +45,10 @@ class Matched:
         return Matched(self.feature[mask], self.pixel[mask], self.point[mask])
 
 
-def find_pose(matched: Matched, lens: Lens, known: bool) -> Pose | str:
-    """The verified pose of a photo, else why there is none, one line. known: the lens is not to be estimated.
+def find_pose(matched: Matched, lens: Lens, trust: float) -> Pose | str:
+    """The verified pose of a photo, else why there is none, one line. trust: in the lens (KNOWN, LIKELY, GUESSED).
     Ambiguity: the search is repeated without the matches of the first pose; an equal texture elsewhere then wins."""
-    best = _ransac(matched, lens, known)
+    best = _ransac(matched, lens, trust)
     if best is None or best.count < MIN_INLIERS:
         found = 0 if best is None else best.count
         return f"{found} features agree with one pose, {MIN_INLIERS} are needed"
@@ -56,21 +56,17 @@ def find_pose(matched: Matched, lens: Lens, known: bool) -> Pose | str:
     if covered < MIN_SPREAD:
         return f"the {best.count} features that agree with one pose cover {covered:.1%} of the picture"
     rest = matched.part(~best.inliers)
-    other = _ransac(rest, best.lens, known=True)
+    other = _ransac(rest, best.lens, KNOWN)
     if other is not None and other.count >= EQUAL * best.count and not _same(best, other, matched.point[best.inliers]):
         return f"two poses fit equally well ({best.count} and {other.count} features): equal textures in two spots"
     return best
 
 
-def _ransac(matched: Matched, lens: Lens, known: bool) -> Pose | None:
+def _ransac(matched: Matched, lens: Lens, trust: float) -> Pose | None:
     """The pose that most matches agree with, refined by them; None if none is found."""
     fixed = _estimated(matched, lens, free=False)
-    if known:
-        return fixed
-    free = _estimated(matched, lens, free=True)
-    if fixed is None or (free is not None and free.count > GROWN * fixed.count):
-        return free
-    return fixed
+    free = None if trust == KNOWN else _estimated(matched, lens, free=True)
+    return free if free is not None and (fixed is None or free.count >= trust * fixed.count) else fixed
 
 
 def _estimated(matched: Matched, lens: Lens, free: bool) -> Pose | None:
@@ -80,7 +76,7 @@ def _estimated(matched: Matched, lens: Lens, free: bool) -> Pose | None:
     estimation, refinement = pycolmap.AbsolutePoseEstimationOptions(), pycolmap.AbsolutePoseRefinementOptions()
     estimation.ransac.max_error = most = tolerance(max(lens.width, lens.height))
     estimation.ransac.random_seed = 0
-    estimation.estimate_focal_length = refinement.refine_focal_length = free
+    estimation.estimate_focal_length = refinement.refine_focal_length = refinement.refine_extra_params = free
     found = pycolmap.estimate_and_refine_absolute_pose(matched.pixel, matched.point, camera, estimation, refinement)
     if found is None:
         return None
