@@ -10,12 +10,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from perception.errors import InputError
+from perception.localise.evidence import doubt
 from perception.localise.joint import Adjustment, adjusted, contradicted
 from perception.localise.keypoints import described, tolerance
 from perception.localise.pose import GUESSED, KNOWN, LIKELY, MIN_INLIERS, Matched, find_pose
@@ -200,7 +202,8 @@ class _Search:
     def _try(self, number: int, matches: np.ndarray, points: np.ndarray, others: int = 0) -> None:
         """Places a photo by matches [M, 2] with points [M, 3]; the last `others` are of other new photos."""
         matched = Matched(matches[:, 0], self.new.pixels[matches[:, 0]], points)
-        found = find_pose(matched, view_lens(self.views[number]), self.trust[number])
+        checked = partial(doubt, self.reference, matched)
+        found = find_pose(matched, view_lens(self.views[number]), self.trust[number], checked)
         if isinstance(found, str):
             self.why[number] = found
             return
