@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.frame.recentre import map_from_input, moved
+from perception.frame.recentre import map_from_input, moved, moved_pose
 from perception.geometry import align_similarity, camera_centres
 from perception.inputs.load import load_scene
 from perception.inputs.readers import reader_of
