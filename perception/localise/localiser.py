@@ -159,6 +159,7 @@ class _Search:
             candidates[number] = self._alone(number)
             self.progress.update("localise: photos", number + 1, len(self.photos))
         self._share_lenses(candidates)
+        self._use_one_unit()
         found = None
         while self.placed:
             found = adjusted(self.reference, self.new, self.placed, self._all_links(), self.most)
@@ -184,6 +185,18 @@ class _Search:
         self.links.clear()
         for number, matches in candidates.items():
             self._try(number, matches, self.reference.points[self.reference.point[matches[:, 1]]])
+
+    def _use_one_unit(self) -> None:
+        """Scales measured depth to the map's unit, if by the map's points it has another."""
+        links = self._all_links()
+        depth, view = self.new.features.depth[links[:, 0]], self.new.features.view[links[:, 0]]
+        rows = np.stack([self.placed.get(n, np.eye(4))[2] for n in range(len(self.photos))])[view]
+        points = self.reference.points[self.reference.point[links[:, 1]]]
+        z, known = (rows[:, :3] * points).sum(axis=1) + rows[:, 3], depth > 0
+        ratio = float(np.median(z[known] / depth[known])) if known.any() else 1.0
+        if not 1 / OTHER_UNIT < ratio < OTHER_UNIT:
+            scaled = replace(self.new.features, depth=self.new.features.depth * max(ratio, 0.0))
+            self.new = replace(self.new, features=scaled)
 
     def _alone(self, number: int) -> np.ndarray:
         """Places a photo by the map's photos alone; its matches [M, 2] with features of the map that have a point."""

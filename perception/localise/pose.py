@@ -18,7 +18,8 @@ MIN_SPREAD = 0.02
 pose loose, and are as likely a picture within the picture."""
 SEARCHES = 3
 EQUAL = 0.7
-"""A second pose with this share of the features of the first makes both doubtful: equal textures in two spots."""
+"""Most searches for poses of one photo. A second pose makes the first doubtful if it explains this share as many
+features that the first does not, as the other way round: equal textures in two spots, or a thing that was moved."""
 SAME_ANGLE, SAME_SHARE = 3.0, 0.05
 """Poses are the same if they differ by less than this angle in degrees and this share of the distance to the points."""
 KNOWN, LIKELY, GUESSED = np.inf, 1.15, 1.0
@@ -65,8 +66,10 @@ def find_pose(matched: Matched, lens: Lens, trust: float, doubt: Callable[[Pose]
     if not found:
         return whys[0]
     best, *others = sorted(found, key=lambda pose: -pose.count)
-    if others and others[0].count >= EQUAL * best.count:
-        return f"two poses fit ({best.count} and {others[0].count} features): equal textures in two spots"
+    for other in others:
+        own, its = (set(matched.feature[pose.inliers].tolist()) for pose in (best, other))
+        if len(own - its) < MIN_INLIERS or len(its - own) >= EQUAL * len(own - its):
+            return f"two poses fit ({best.count} and {other.count} features): equal textures in two spots"
     return best
 
 

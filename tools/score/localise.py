@@ -7,8 +7,9 @@ KNOWN: a map, or a posed input, of which no map is made, as localisation needs p
 KNOWN's world; its poses are the truth, and only its lenses and depth images are used. --gone: the map's photos are not
 used, only its renders. --alone: a call for each photo, as a robot asks. --leave-out N: every N-th photo of KNOWN, a
 transforms.json, is left out and localised. --truth: other poses of the same photos. Prints a line for each photo, then
-one JSON object; seconds are of CPU time. KNOWN's own poses may be refined, and differ from the truth together:
-"own_photos" has their errors, "aligned" those of all after the similarity that brings the truth of its photos to them.
+one JSON object; seconds are of CPU time. With --truth,
+from which KNOWN's refined poses differ together, "own_photos" has their errors, and "beside" those of the new photos
+relative to the nearest of KNOWN's.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.frame.recentre import map_from_input, moved, moved_pose
-from perception.geometry import align_similarity, camera_centres
+from perception.frame.recentre import map_from_input, moved
+from perception.geometry import camera_centres, inverse_se3
 from perception.inputs.load import load_scene
 from perception.inputs.readers import reader_of
 from perception.inputs.transforms import transforms_file
@@ -75,15 +76,15 @@ def named(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {Path(name).name: pose for name, pose in poses.items()}
 
 
-def aligned(truths: dict[str, np.ndarray], poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The truths moved by the similarity that brings those of the map's photos to the map's poses."""
+def beside(truths: dict[str, np.ndarray], poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The truths moved as the nearest of the map's photos lies by the map."""
     both = [(pose, truths[name]) for name, pose in named(poses).items() if name in truths]
-    if len(both) < 3:
-        return truths
-    scale, turn, shift = align_similarity(*(camera_centres(np.stack(each)) for each in zip(*both, strict=True)))
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = scale * turn, shift
-    return {name: moved_pose(pose, matrix) for name, pose in truths.items()}
+    centers = camera_centres(np.stack([truth for _, truth in both]))
+    moved_truths = {}
+    for name, truth in truths.items():
+        pose, near = both[int(np.linalg.norm(centers - camera_centres(truth[None]), axis=1).argmin())]
+        moved_truths[name] = truth @ inverse_se3(near) @ pose
+    return moved_truths
 
 
 def errors_of(found: list[Localised], truths: dict[str, np.ndarray]) -> list[tuple[float, ...]]:
@@ -127,13 +128,15 @@ def score(args: argparse.Namespace, workdir: Path) -> dict[str, Any]:
         print(f"{answer.name}: {what}")
     poses = {view.name: view.camera_from_world for view in gmap.views}
     here = [answer for answer in found if isinstance(answer, Localised)]
-    moved_truths = aligned(truths, poses)
+    compared = {}
+    if args.truth is not None:
+        own = [difference(pose, truths[name]) for name, pose in named(poses).items() if name in truths]
+        compared = {"own_photos": figures(own), "beside": figures(errors_of(here, beside(truths, poses)))}
     return {
         "photos": len(new),
         "localised": sum(isinstance(answer, Localised) for answer in found),
         **figures(errors_of(here, truths)),
-        "own_photos": figures([difference(pose, truths[n]) for n, pose in named(poses).items() if n in truths]),
-        "aligned": figures(errors_of(here, moved_truths)),
+        **compared,
         "rendered": len(localiser.rendered),
         "seconds_to_open": opened,
         "seconds_a_photo": seconds / len(new),
