@@ -184,7 +184,7 @@ class QueryMap(Map):
     def localise(
         self, photo: str | Path | np.ndarray, lens: Lens | None = None, depth: DepthImage | None = None
     ) -> Localised | None:
-        """The pose of a new photo, a file or [h, w, 3] uint8 RGB, in the map's own frame; None where it is not in this
+        """The pose of a new photo, a file or [H, W, 3] uint8 RGB, in the map's own frame; None where it is not in this
         map (see `Localiser`). lens: if known; depth: scale in the map's unit. The first call reads the map's photos."""
         if isinstance(photo, np.ndarray):
             from perception.localise.reference import write_rgb

@@ -7,8 +7,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from perception.map.write import write_map
+from perception.photos.view_json import stored_view
 from perception.types import View
 from support.aimed import look_at
+from support.viewer_maps import small_map
 
 SIDES = np.array([4.0, 3.0, 2.4])
 SIZE = (400, 300)
@@ -86,3 +89,12 @@ def difference(pose: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
     turn = pose[:3, :3] @ truth[:3, :3].T
     angle = np.degrees(np.arctan2(np.linalg.norm(turn - turn.T) / np.sqrt(8), (np.trace(turn) - 1) / 2))
     return float(np.linalg.norm(centers[0] - centers[1])), float(angle)
+
+
+def write_room_map(path: Path, room: PaintedRoom, poses: list[np.ndarray], photos: Path) -> Path:
+    """A map of Gaussians before wall 1, whose views have their photos in the folder `photos`."""
+    gmap = small_map()
+    gmap.means = (0.3 * gmap.means[:, [2, 0, 1]] + (1.5, 1.5, 1.2)).astype(np.float32)
+    gmap.views = [stored_view(room.view(photos, f"{n}.png", pose), path) for n, pose in enumerate(poses)]
+    write_map(path, gmap)
+    return path
