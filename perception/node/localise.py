@@ -24,12 +24,12 @@ from perception.types import Lens
 class Localising:
     """Answers one image at a time; those that come meanwhile are dropped, so that an answer is never old. Thread-safe.
 
-    transport: `core.Transport`. An image is answered by its pose, if it has one, and by JSON, also where it has none;
-    both have the image's stamp.
+    transport: `core.Transport`. photos: a folder where the map's photos may be read beside its own. An image is answered
+    by its pose, if it has one, and by JSON, also where it has none; both have the image's stamp.
     """
 
     def __init__(self, engine: QueryEngine, transport: Any, config: NodeConfig) -> None:
-        self._engine, self._transport, self._photos = engine, transport, config.photos_folder
+        self._engine, self._transport, self.photos = engine, transport, config.photos_folder
         self._lens: Lens | None = None
         self._one = threading.Lock()
         self.dropped = 0
@@ -59,7 +59,7 @@ class Localising:
         lens = self._lens
         if lens is not None and (lens.width, lens.height) != picture.shape[1::-1]:
             lens = None  # of another camera
-        return gmap, localised(gmap, encoded(message, picture)[1], lens, self._photos)
+        return gmap, localised(gmap, encoded(message, picture)[1], lens, self.photos)
 
     def _finish(self, message: Any, done: Future[tuple[QueryMap, Localised | NotHere]]) -> None:
         self._one.release()
