@@ -24,8 +24,8 @@ from perception.types import Lens
 class Localising:
     """Answers one image at a time; those that come meanwhile are dropped, so that an answer is never old. Thread-safe.
 
-    transport: `core.Transport`. photos: a folder where the map's photos may be read beside its own. An image is answered
-    by its pose, if it has one, and by JSON, also where it has none; both have the image's stamp.
+    transport: `core.Transport`. photos: a folder where the map's photos may be read beside its own. An image is
+    answered by its pose, if it has one, and by JSON, also where it has none; both have the image's stamp.
     """
 
     def __init__(self, engine: QueryEngine, transport: Any, config: NodeConfig) -> None:
