@@ -23,8 +23,8 @@ from perception.localise.keypoints import described, tolerance
 from perception.localise.pose import GUESSED, KNOWN, LIKELY, MIN_INLIERS, Matched, find_pose
 from perception.localise.reference import Locate, Reference, open_reference
 from perception.map.map import Map
-from perception.photos.decode import photo_size, why_left_out
-from perception.photos.lens import camera_from_lens, load_pycolmap, rescale_lens, same_aspect
+from perception.photos.decode import CAMERA_FOLDER, exif_of, open_photo, photo_size, why_left_out
+from perception.photos.lens import camera_from_lens, rescale_lens, same_aspect
 from perception.photos.views import make_view, view_lens
 from perception.progress import QUIET, Progress
 from perception.sfm.database import build_features
@@ -37,6 +37,8 @@ ALIKE, MORE = 10, 60
 SAME_FOCAL = 0.15
 """Largest relative difference of a photo's focal length in EXIF from that of the map's camera of the same size, for the
 map's camera to be taken: EXIF states nominal values."""
+USUAL_FOCAL = 1.2
+"""Focal length of an unknown camera to start from, in long sides of the picture, as COLMAP takes it."""
 OTHER_UNIT = 1.5
 """Measured depth is scaled if it differs from that of the map's points by this factor: it has another unit."""
 
@@ -174,12 +176,13 @@ class _Search:
     def _share_lenses(self, candidates: dict[int, np.ndarray]) -> None:
         """Photos with one assumed lens were taken by one camera: all get the estimate of median focal length."""
         shared, lenses = dict[Lens, list[Lens]](), [view_lens(view) for view in self.views]
-        for number in sorted(self.placed):
+        for number in sorted(number for number in self.placed if self.trust[number] != KNOWN):
             shared.setdefault(lenses[number], []).append(self.lenses[number])
         chosen = {lens: sorted(found, key=lambda each: each.params)[len(found) // 2] for lens, found in shared.items()}
         if all(lens == found for lens, found in chosen.items()):
             return
-        self._see([chosen.get(lens, lens) for lens in lenses])
+        known = [trust == KNOWN for trust in self.trust]
+        self._see([lens if sure else chosen.get(lens, lens) for lens, sure in zip(lenses, known, strict=True)])
         self.trust = (KNOWN,) * len(lenses)
         self.placed.clear()
         self.links.clear()
@@ -276,18 +279,26 @@ def _lens_of(photo: NewPhoto, views: list[View]) -> tuple[Lens, float]:
     another focal length; else EXIF's or a usual one."""
     if photo.lens is not None:
         return photo.lens, KNOWN
-    pycolmap = load_pycolmap()
     width, height = photo_size(photo.photo)
-    exif = pycolmap.infer_camera_from_image(photo.photo)
-    stated = exif.mean_focal_length() / max(exif.width, exif.height) * max(width, height)
+    stated = _exif_focal(photo.photo, max(width, height))
     for view in views:
         lens = view_lens(view)
         if same_aspect((width, height), (lens.width, lens.height)):
             lens = rescale_lens(lens, width, height)
             focal = camera_from_lens(lens).mean_focal_length()
-            if not exif.has_prior_focal_length or abs(stated / focal - 1) <= SAME_FOCAL:
+            if stated is None or abs(stated / focal - 1) <= SAME_FOCAL:
                 return lens, LIKELY
-    return Lens("SIMPLE_RADIAL", (stated, width / 2, height / 2, 0.0), width, height), GUESSED
+    focal = USUAL_FOCAL * max(width, height) if stated is None else stated
+    return Lens("SIMPLE_RADIAL", (focal, width / 2, height / 2, 0.0), width, height), GUESSED
+
+
+def _exif_focal(photo: Path, long_side: int) -> float | None:
+    """The focal length in pixels by EXIF's for 35 mm film, whose long side is 36 mm; None where it is not stated."""
+    with open_photo(photo) as image:
+        millimetres = exif_of(image, photo, CAMERA_FOLDER).get(0xA405)
+    if isinstance(millimetres, (int, float)) and 5 <= millimetres <= 500:
+        return millimetres / 36 * long_side
+    return None
 
 
 def _finder(gmap: Map, folder: Path | None) -> Locate:

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from perception.localise.localiser import Localised, Localiser, NewPhoto, NotHere
 from perception.map.map import Map
@@ -130,3 +131,21 @@ def test_a_map_without_matches_knows_no_photo(tmp_path: Path) -> None:
     views = [room.view(tmp_path, "a.png", walk(0, 2)[0]), room.view(tmp_path, "b.png", walk(1, 2)[0])]
     answer = Localiser(Map(views=views, info={})).answers(new(room, tmp_path, walk(0, 3)[1:2]))[0]
     assert isinstance(answer, NotHere)
+
+
+def test_photos_of_all_kinds_are_read(room: PaintedRoom, known: Localiser, tmp_path: Path) -> None:
+    """Another format, grey, turned by EXIF, with EXIF's focal length; black ones are no error."""
+    truth = walk(1, 4, 0.15)[1]
+    photo, exif, turned = Image.fromarray(room.photo(truth)[0]), Image.Exif(), Image.Exif()
+    exif.get_ifd(0x8769)[0xA405], turned[0x0112] = 27, 6
+    photo.save(tmp_path / "a.webp", lossless=True)
+    photo.convert("L").save(tmp_path / "grey.png")
+    photo.save(tmp_path / "exif.jpg", quality=95, exif=exif)
+    photo.transpose(Image.Transpose.ROTATE_90).save(tmp_path / "turned.jpg", quality=95, exif=turned)
+    Image.new("RGB", (400, 300)).save(tmp_path / "black.png")
+    Image.new("RGB", (4, 4)).save(tmp_path / "tiny.png")
+    names = ["a.webp", "exif.jpg", "grey.png", "turned.jpg", "black.png", "tiny.png"]
+    found = known.localise([tmp_path / name for name in names])
+    assert [answer is not None for answer in found] == [True] * 4 + [False] * 2
+    for answer in found[:4]:
+        assert answer is not None and difference(answer.camera_from_map, truth)[0] < NEAR[0]
