@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,6 +26,7 @@ from perception.localise.reference import Locate, Reference, open_reference
 from perception.map.map import Map
 from perception.photos.decode import CAMERA_FOLDER, exif_of, open_photo, photo_size, why_left_out
 from perception.photos.lens import camera_from_lens, rescale_lens, same_aspect
+from perception.photos.view_json import locate_photo
 from perception.photos.views import make_view, view_lens
 from perception.progress import QUIET, Progress
 from perception.sfm.database import build_features
@@ -302,14 +304,16 @@ def _exif_focal(photo: Path, long_side: int) -> float | None:
 
 
 def _finder(gmap: Map, folder: Path | None) -> Locate:
-    """Photos where the map records them, else in `folder` by the view's name, of the recorded size."""
+    """Photos where the map records them, else in `folder` by the view's name or the file's, of the recorded size."""
 
     def locate(view: View) -> View:
         try:
-            return gmap.with_photo(view)
+            return replace(view, photo=locate_photo(view, gmap.path))
         except InputError:
-            if folder is None:
-                raise
-            return gmap.with_photo(replace(view, photo=folder / view.name, photo_beside=None))  # type: ignore[call-arg]
+            found = (folder / name for name in (view.name, Path(view.name).name)) if folder is not None else ()
+            for file in found:
+                with suppress(InputError):
+                    return replace(view, photo=locate_photo(replace(view, photo=file), None))
+            raise
 
     return locate
