@@ -59,6 +59,7 @@ def test_covariances_are_those_of_repeated_noise() -> None:
         changes.append(found.poses.since(poses)[-1])
         covariances.append(found.covariances()[0])
     seen, told = np.std(changes, axis=0), np.sqrt(np.mean([np.diag(c) for c in covariances], axis=0))
-    # 40 draws give a standard deviation to 11 %. The noise estimated from all residuals is a fifth less than that of
-    # the features, as the points have been fitted to them; the weights of the robust loss make up for it.
-    assert np.all((told / seen > 0.75) & (told / seen < 1.5)), told / seen
+    # 40 draws give a standard deviation to 11 %, and the mean of six to 5 %. The weights of the robust loss take away a
+    # fifth of the information; steps that gain little are not taken, so that poses stay a little nearer to the start.
+    ratio = told / seen
+    assert 0.85 < np.exp(np.log(ratio).mean()) < 1.45 and np.all((ratio > 0.7) & (ratio < 1.8)), ratio
