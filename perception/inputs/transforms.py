@@ -19,7 +19,7 @@ from perception.inputs.start_cloud import start_points
 from perception.io.documents import brief, read_json, safe_name
 from perception.photos.decode import SUFFIXES, photo_size, why_left_out
 from perception.photos.ignore_masks import mask_of
-from perception.photos.lens import FISHEYE, PERSPECTIVE, opencv_lens
+from perception.photos.lens import FISHEYE, PERSPECTIVE, camera_from_lens, opencv_lens
 from perception.photos.named_files import NamedFiles
 from perception.photos.view_json import absolute
 from perception.photos.views import first_of, posed_view, rigid_pose
@@ -121,6 +121,24 @@ def read_frames(file: Path) -> list[tuple[str, np.ndarray, Lens]]:
         if not values.keys() >= _NEEDED:
             raise InputError(f"{file}: frame {index} {_LACKS}")
     return [(str(values["file_path"]), _pose(file, values), _lens(file, values, None)) for values in frames]
+
+
+def in_map_frame(file: Path) -> bool:
+    """Whether its poses are in the frame of a map, as `perception localise` writes them, not in that of an input."""
+    data = read_json(file)
+    return isinstance(data, dict) and "map_id" in data
+
+
+def lens_values(lens: Lens) -> dict[str, Any]:
+    """The keys of a lens in transforms.json, as this file reads them. InputError for a model that has none there."""
+    names = {"f": ("fl_x", "fl_y"), "fx": ("fl_x",), "fy": ("fl_y",), "k": ("k1",)}
+    fisheye = "FISHEYE" in lens.model
+    values: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV"}
+    for name, value in zip(camera_from_lens(lens).params_info.split(", "), lens.params, strict=True):
+        values.update(dict.fromkeys(names.get(name, (name,)), value))
+    if values.keys() - {"camera_model", "fl_x", "fl_y", "cx", "cy", *(FISHEYE if fisheye else PERSPECTIVE)}:
+        raise InputError(f"camera model {lens.model} cannot be written to a transforms.json; undistort the photos")
+    return {**values, "w": lens.width, "h": lens.height}
 
 
 def listed_photos(source: Path) -> tuple[list[Path], bool]:

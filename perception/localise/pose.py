@@ -1,0 +1,114 @@
+"""The pose of one photo from features that match points of a map: RANSAC, verified, and not one of two equals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from perception.localise.keypoints import tolerance
+from perception.photos.lens import camera_from_lens, lens_from_camera, load_pycolmap
+from perception.types import Lens
+
+MIN_INLIERS = 20
+"""Least features of a photo that agree with its pose."""
+MIN_SPREAD = 0.02
+"""Least share of the picture that the agreeing features cover: the ellipse of two standard deviations. Fewer leave the
+pose loose, and are as likely a picture within the picture."""
+SEARCHES = 3
+EQUAL = 0.7
+"""Most searches for poses of one photo. A second pose makes the first doubtful if it explains this share as many
+features that the first does not, as the other way round: equal textures in two spots, or a thing that was moved."""
+SAME_ANGLE, SAME_SHARE = 3.0, 0.05
+"""Poses are the same if they differ by less than this angle in degrees and this share of the distance to the points."""
+KNOWN, LIKELY, GUESSED = np.inf, 1.15, 1.0
+"""How far a lens is trusted: an estimated one replaces it if that makes this many times as many features agree."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """camera_from_map [4, 4]; inliers [M]: mask of the matches that agree; count: features among them; lens."""
+
+    camera_from_map: np.ndarray
+    inliers: np.ndarray
+    count: int
+    lens: Lens
+
+
+@dataclass(frozen=True)
+class Matched:
+    """Matches [M] of a photo with points of the map: feature [M], its pixel [M, 2], point [M, 3] in the map's frame."""
+
+    feature: np.ndarray
+    pixel: np.ndarray
+    point: np.ndarray
+
+
+def find_pose(matched: Matched, lens: Lens, trust: float, doubt: Callable[[Pose], str | None]) -> Pose | str:
+    """The verified pose of a photo, else why there is none, one line. trust: in the lens (KNOWN, LIKELY, GUESSED).
+    doubt: further checks of a pose. The search is repeated without the matches of the poses before: the thing or
+    texture that a pose rests on may be elsewhere now, or in two spots; then no pose is right for sure."""
+    found, whys, rest = list[Pose](), list[str](), np.ones(len(matched.feature), bool)
+    for _ in range(SEARCHES):
+        pose = _ransac(matched, rest, lens, trust)
+        count = 0 if pose is None else pose.count
+        if pose is None or count < MIN_INLIERS:
+            whys.append(f"{count} features agree with one pose, {MIN_INLIERS} are needed")
+            break
+        rest &= ~pose.inliers
+        if (covered := _spread(matched.pixel[pose.inliers], lens)) < MIN_SPREAD:
+            whys.append(f"the {count} features that agree with one pose cover {covered:.1%} of the picture")
+        elif (why := doubt(pose)) is not None:
+            whys.append(why)
+        elif not any(_same(pose, other, matched.point[pose.inliers]) for other in found):
+            found.append(pose)
+    if not found:
+        return whys[0]
+    best, *others = sorted(found, key=lambda pose: -pose.count)
+    for other in others:
+        own, its = (set(matched.feature[pose.inliers].tolist()) for pose in (best, other))
+        if len(own - its) < MIN_INLIERS or len(its - own) >= EQUAL * len(own - its):
+            return f"two poses fit ({best.count} and {other.count} features): equal textures in two spots"
+    return best
+
+
+def _ransac(matched: Matched, used: np.ndarray, lens: Lens, trust: float) -> Pose | None:
+    """The pose that most of the `used` matches agree with, refined by them; None if none is found."""
+    fixed = _estimated(matched, used, lens, free=False)
+    free = None if trust == KNOWN else _estimated(matched, used, lens, free=True)
+    return free if free is not None and (fixed is None or free.count >= trust * fixed.count) else fixed
+
+
+def _estimated(matched: Matched, used: np.ndarray, lens: Lens, free: bool) -> Pose | None:
+    if used.sum() < MIN_INLIERS:
+        return None
+    pycolmap, camera = load_pycolmap(), camera_from_lens(lens)
+    estimation, refinement = pycolmap.AbsolutePoseEstimationOptions(), pycolmap.AbsolutePoseRefinementOptions()
+    estimation.ransac.max_error = most = tolerance(max(lens.width, lens.height))
+    estimation.ransac.random_seed = 0
+    estimation.estimate_focal_length = refinement.refine_focal_length = refinement.refine_extra_params = free
+    pixel, point = matched.pixel[used], matched.point[used]
+    found = pycolmap.estimate_and_refine_absolute_pose(pixel, point, camera, estimation, refinement)
+    if found is None or not np.isfinite(camera.params).all() or camera.mean_focal_length() <= 0:
+        return None
+    pose = np.vstack([found["cam_from_world"].matrix(), [0, 0, 0, 1]])
+    x = matched.point @ pose[:3, :3].T + pose[:3, 3]
+    projected = np.asarray(camera.img_from_cam(x), np.float64).reshape(-1, 2)
+    good = (x[:, 2] > 0) & (np.linalg.norm(projected - matched.pixel, axis=1) <= most)
+    return Pose(pose, good, len(np.unique(matched.feature[good])), lens_from_camera(camera))
+
+
+def _spread(pixel: np.ndarray, lens: Lens) -> float:
+    """Share of the picture within the ellipse of two standard deviations of pixels [M, 2]."""
+    variance = np.linalg.eigvalsh(np.cov(pixel.T))
+    return float(4 * np.pi * np.sqrt(np.maximum(variance, 0).prod()) / (lens.width * lens.height))
+
+
+def _same(a: Pose, b: Pose, points: np.ndarray) -> bool:
+    """Whether two poses are one: points seen twice have two positions, and moved things poses of their own."""
+    turn = a.camera_from_map[:3, :3] @ b.camera_from_map[:3, :3].T
+    angle = np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
+    centers = [-pose.camera_from_map[:3, :3].T @ pose.camera_from_map[:3, 3] for pose in (a, b)]
+    distance = np.median(np.linalg.norm(points - centers[0], axis=1))
+    return bool(angle < SAME_ANGLE and np.linalg.norm(centers[0] - centers[1]) < SAME_SHARE * distance)
