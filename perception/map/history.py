@@ -13,9 +13,9 @@ past             where it stood before, oldest first: {"until", "centroid", "obb
                  where that is not known, as for a removed thing. ambiguous: another motion, or another thing that looks
                  alike, explains the visit as well. "gone": true: it was away until that visit; it has come back since.
 
-A removed instance stays in instances.json and language.npz, with `num_gaussians` 0 and its last box. An entry of `past`
-with the until of its removal is written for it, too. past.npz holds the means of what stood elsewhere: means [M, 3]
-float32, ids [M] int32, until [M] int32 as in `past`.
+A removed instance stays in instances.json and language.npz, with `num_gaussians` 0 and its last box; the last entry of
+its `past` is the spot that it left. past.npz holds the means of what stood elsewhere: means [M, 3] float32, ids [M]
+int32, until [M] int32 as in `past`.
 """
 
 from __future__ import annotations
@@ -105,10 +105,18 @@ def stood(entry: dict[str, Any], visit: int) -> dict[str, Any] | None:
     return None if is_removed(entry) else entry
 
 
-def removed_since(entry: dict[str, Any]) -> int:
-    """The visit at which a removed entry was first missed."""
+def left(entry: dict[str, Any], visit: int) -> dict[str, Any] | None:
+    """The last spot of an entry that stood nowhere as of a visit, of its `past`; None when it stood, or never had."""
+    if stood(entry, visit) is not None:
+        return None
+    earlier = (spot for spot in reversed(entry.get("past", [])) if spot["until"] < visit and not spot.get("gone"))
+    return next(earlier, None)
+
+
+def since(entry: dict[str, Any]) -> int:
+    """The visit that first found an entry where it is today; that first missed it, if it is removed."""
     past = entry.get("past")
-    return int(past[-1]["until"] if past else entry.get("last_seen", 0)) + 1
+    return int(past[-1]["until"]) + 1 if past else int(entry.get("first_seen", 0))
 
 
 def last_seen(entry: dict[str, Any], newest: int) -> int:
@@ -119,24 +127,23 @@ def last_seen(entry: dict[str, Any], newest: int) -> int:
 # ------------------------------------------------------------------ changes
 
 
-def changes_of(info: dict[str, Any], instances: list[dict[str, Any]], since: int) -> list[dict[str, Any]]:
-    """What differs between the scene as of visit `since` and today, by `STATES`, then in the order of `instances`.
+def changes_of(visits: list[Visit], instances: list[dict[str, Any]], start: int) -> list[dict[str, Any]]:
+    """What differs between the scene as of visit `start` and today, by `STATES`, then in the order of `instances`.
 
     One dict per instance that stood then or stands today: state, instance_id, label, confidence, old_centroid,
     new_centroid (None where it stood or stands nowhere), transform ([4, 4] new_from_old, None where it is not known),
     last_seen (number of a visit); of a moved or removed one also since, the visit that found it so, and ambiguous.
-    unseen: no visit after `since` looked there. confidence: that of the newest visit.
+    unseen: no visit after `start` saw it, and none missed it. confidence: that of the newest visit.
     """
-    newest = len(visits_of(info)) - 1
-    found = [change for entry in instances if (change := _change(entry, since, newest)) is not None]
-    return sorted(found, key=lambda change: STATES.index(change["state"]))
+    changes = [change for entry in instances if (change := _change(entry, start, len(visits) - 1)) is not None]
+    return sorted(changes, key=lambda change: STATES.index(change["state"]))
 
 
-def _change(entry: dict[str, Any], since: int, newest: int) -> dict[str, Any] | None:
-    before, after = stood(entry, since), None if is_removed(entry) else entry
+def _change(entry: dict[str, Any], start: int, newest: int) -> dict[str, Any] | None:
+    before, after = stood(entry, start), None if is_removed(entry) else entry
     if before is None and after is None:
         return None
-    later = [spot for spot in entry.get("past", ()) if spot["until"] >= since]
+    later = [spot for spot in entry.get("past", ()) if spot["until"] >= start]
     seen = last_seen(entry, newest)
     if before is None:
         state = "added"
@@ -145,7 +152,7 @@ def _change(entry: dict[str, Any], since: int, newest: int) -> dict[str, Any] | 
     elif later:
         state = "moved"
     else:
-        state = "unchanged" if seen >= min(since + 1, newest) else "unseen"
+        state = "unchanged" if seen >= min(start + 1, newest) else "unseen"
     change = {
         "state": state,
         "instance_id": entry["id"],
@@ -157,7 +164,7 @@ def _change(entry: dict[str, Any], since: int, newest: int) -> dict[str, Any] | 
         "last_seen": seen,
     }
     if state in ("moved", "removed"):
-        change["since"] = removed_since(entry)
+        change["since"] = since(entry)
         change["ambiguous"] = any(spot.get("ambiguous", False) for spot in later)
     return change
 
@@ -186,5 +193,6 @@ def check_record(entry: dict[str, Any], visits: int) -> None:
         raise ValueError(f"past: until of {name} is {ends[:9]}, expected ascending visits below {visits - 1}")
     if entry.get("state") == "moved" and ends[-1:] != [visits - 2]:
         raise ValueError(f"past: {name} was moved by visit {visits - 1}, and no entry with until {visits - 2} is last")
-    if is_removed(entry) and (entry["num_gaussians"] or entry.get("parts")):
-        raise ValueError(f"num_gaussians: {name} is removed, so it has no Gaussians and no parts")
+    bare = not entry["num_gaussians"] and not entry.get("parts")
+    if is_removed(entry) and not (bare and ends and not entry["past"][-1].get("gone")):
+        raise ValueError(f"past: {name} is removed, so it has the spot that it left, no Gaussians and no parts")

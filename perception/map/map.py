@@ -196,6 +196,11 @@ class Map:
         """Short identifier of the map and its labels; it changes when either changes."""
         return "unsaved" if self.files is None else self.files.map_id
 
+    @property
+    def newest_visit(self) -> int:
+        """The number of the newest visit (see `map.history`), 0 in a map of one."""
+        return len(self.info.get("visits") or [0]) - 1
+
     def setting(self, group: str, name: str, default: Any) -> Any:
         """The setting GROUP.NAME that the map was made with; `default` where it is not recorded, or is none."""
         value = self.info.get("config", {}).get(group, {}).get(name)
