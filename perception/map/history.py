@@ -20,7 +20,7 @@ int32, until [M] int32 as in `past`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Literal, get_args
@@ -68,7 +68,7 @@ def visits_of(info: dict[str, Any], photos: int = 0) -> list[Visit]:
     return [Visit(n, v["time"], v["input"], v["photos"]) for n, v in enumerate(info.get("visits") or [only])]
 
 
-def date_of(visits: list[Visit], number: int) -> str:
+def date_of(visits: Sequence[Visit], number: int) -> str:
     """The date of a visit in UTC, with the time of day if another visit has the same date; "visit 2" without a time."""
     days = [datetime.fromisoformat(v.time.removesuffix("Z")) if v.time else None for v in visits]
     day = days[number]
@@ -78,7 +78,7 @@ def date_of(visits: list[Visit], number: int) -> str:
     return f"{day:%Y-%m-%d}" if alone else f"{day:%Y-%m-%d %H:%M}"
 
 
-def visit_number(visits: list[Visit], text: str | int) -> int:
+def visit_number(visits: Sequence[Visit], text: str | int) -> int:
     """The visit that `text` names: its number, or "last", the one before the newest; InputError when there is none."""
     newest = len(visits) - 1
     number = max(newest - 1, 0) if text == "last" else int(text) if str(text).isdecimal() else -1
@@ -127,7 +127,7 @@ def last_seen(entry: dict[str, Any], newest: int) -> int:
 # ------------------------------------------------------------------ changes
 
 
-def changes_of(visits: list[Visit], instances: list[dict[str, Any]], start: int) -> list[dict[str, Any]]:
+def changes_of(visits: Sequence[Visit], instances: list[dict[str, Any]], start: int) -> list[dict[str, Any]]:
     """What differs between the scene as of visit `start` and today, by `STATES`, then in the order of `instances`.
 
     One dict per instance that stood then or stands today: state, instance_id, label, confidence, old_centroid,

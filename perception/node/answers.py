@@ -38,6 +38,8 @@ POINTS = Channel("answer/points", "sensor_msgs/msg/PointCloud2")
 BOXES = Channel("answer/detections", "vision_msgs/msg/Detection3DArray")
 MARKS = Channel("answer/markers", "visualization_msgs/msg/MarkerArray")
 MAP_CLOUD = Channel("map/points", "sensor_msgs/msg/PointCloud2", latched=True)
+CHANGES = Channel("changes", "std_msgs/msg/String", latched=True)
+"""Output: JSON of `QueryMap.changes_json`, since the visit before the newest, with map_id and stamp."""
 HEALTH = Channel("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 """The topic on which ROS tools expect health (REP 107)."""
 
@@ -45,7 +47,7 @@ QUERY = Channel("query", "rcl_interfaces/srv/GetParameters")
 """The standard service type that takes texts and returns typed values: each name is a prompt, each value its answer."""
 RELOAD = Channel("reload", "std_srvs/srv/Trigger")
 
-OUTPUTS = (ANSWER, POINTS, BOXES, MARKS, MAP_CLOUD, HEALTH)
+OUTPUTS = (ANSWER, POINTS, BOXES, MARKS, MAP_CLOUD, CHANGES, HEALTH)
 
 DEPTH = 64
 """Largest number of messages queued for a slow reader; older ones are dropped, which bounds the memory."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -129,6 +129,12 @@ class Hit:
         if self.map is not None:
             answer |= {"map": self.map, "map_id": self.map_id, "frame": self.frame, "metric": self.metric}
         return answer if self.distance is None else {**answer, "distance": float(self.distance)}
+
+
+def answer_json(text: str, hits: Sequence[Hit], gone: Sequence[Hit]) -> dict[str, Any]:
+    """The answer to a prompt as an entry of `results` in the JSON output; gone: of `QueryMap.gone`."""
+    answer = {"text": text, "present": bool(hits), "hits": [hit.to_json() for hit in hits]}
+    return {**answer, "gone": [hit.to_json() for hit in gone]} if gone else answer
 
 
 Hit.points = _Points()  # type: ignore[assignment]

@@ -193,6 +193,16 @@ class QueryMap(Map):
         frame (`history.changes_of`). InputError for a visit that the map does not have."""
         return changes_of(self.visits, self.record.instances, visit_number(self.visits, since))
 
+    def changes_json(self, since: int | str = "last") -> dict[str, Any]:
+        """`changes` as JSON, with the visits that they name by number."""
+        start = visit_number(self.visits, since)
+        facts = {"changes": self.changes(start), "since": start, "visits": [visit.to_json() for visit in self.visits]}
+        return {**facts, "frame": self.frame, "metric": self.metric}
+
+    def visits_json(self) -> dict[str, Any]:
+        """What answers whose hits name visits hold beside: {"visits"}; {} for a map of one visit."""
+        return {"visits": [visit.to_json() for visit in self.visits]} if self.newest_visit else {}
+
     def at(self, visit: int | str) -> QueryMap:
         """The map as it stood as of a visit, with the points of then: for prompts and all questions about instances.
         Gaussians, free space and photos are today's. InputError for a visit that the map does not have."""
@@ -210,11 +220,8 @@ class QueryMap(Map):
     ) -> list[Hit]:
         """As `query`, the instances that are gone and answer `text` when they are compared with all others: hits where
         they stood last, with `since` and, where it is known, what they `stood` on."""
-        spots = {e["id"]: (e, spot) for e in self.record.instances if (spot := left(e, self._visit)) is not None}
-        if not spots:
-            return []
-        hits: list[Hit] = []
-        for hit in self._last_known.query(text, MAX_TOP, min_score, where=where, frame=frame):
+        spots, hits = self._left, list[Hit]()
+        for hit in self.last_known.query(text, MAX_TOP, min_score, where=where, frame=frame) if spots else ():
             if hit.instance_id in spots and len(hits) < top_k:
                 entry, spot = spots[hit.instance_id]
                 until, seen = spot["until"], last_seen(entry, self.newest_visit)
@@ -234,9 +241,18 @@ class QueryMap(Map):
         return held_by(self)
 
     @cached_property
-    def _last_known(self) -> QueryMap:
+    def _left(self) -> dict[int, tuple[Spot, Spot]]:
+        """Of what is gone, by its id: the entry, and the spot that it left."""
+        return {e["id"]: (e, spot) for e in self.record.instances if (spot := left(e, self._visit)) is not None}
+
+    @cached_property
+    def last_known(self) -> QueryMap:
         """This map, and every instance that it does not have any more where it stood last."""
-        return self._scene(self._visit, lambda entry: stood(entry, self._visit) or left(entry, self._visit))
+        return (
+            self
+            if not self._left
+            else self._scene(self._visit, lambda entry: stood(entry, self._visit) or left(entry, self._visit))
+        )
 
     def _scene(self, visit: int, spot_of: Callable[[Spot], Spot | None]) -> QueryMap:
         fields = scene(self.record, spot_of)

@@ -120,7 +120,11 @@ def _spot(name: str, until: int, k: int | None) -> dict[str, Any]:
     """The entry of `past` of a thing that was in cell k, or away, until a visit."""
     if k is None:
         where = instance_entry(0, ball(name, 8).astype(np.float64), np.ones(_BALL), 1.0, 0, None)
-        return {key: where[key] for key in ("centroid", "obb", "aabb")} | {"until": until, "transform": None, "gone": True}
+        return {key: where[key] for key in ("centroid", "obb", "aabb")} | {
+            "until": until,
+            "transform": None,
+            "gone": True,
+        }
     where = instance_entry(0, ball(name, k).astype(np.float64), np.ones(_BALL), 1.0, 0, None)
     motion = np.eye(4)
     following = STOOD[until + 1].get(name)
