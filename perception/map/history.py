@@ -179,6 +179,32 @@ def _motion(spots: Iterable[dict[str, Any]]) -> list[list[float]] | None:
     return whole.tolist()
 
 
+# ------------------------------------------------------------------ edits
+
+
+def joined_record(entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The record of one thing that is made of others, {} where there is none: first and last visits, and the state that
+    all share, else "unchanged"; without past, so nothing that is made of others has moved."""
+    if any("state" not in entry for entry in entries):
+        return {}
+    states = {entry["state"] for entry in entries}
+    state = states.pop() if len(states) == 1 and states != {"moved"} else "unchanged"
+    record: dict[str, Any] = {"state": state}
+    for key, choose in (("confidence", min), ("first_seen", min), ("last_seen", max), ("last_looked_for", max)):
+        if values := [entry[key] for entry in entries if key in entry]:
+            record[key] = choose(values)
+    return record
+
+
+def past_of(past: dict[str, np.ndarray], instances: Iterable[dict[str, Any]]) -> dict[str, np.ndarray]:
+    """The rows of past.npz that belong to a spot of these instances."""
+    if not past:
+        return {}
+    spots = {(entry["id"], spot["until"]) for entry in instances for spot in entry.get("past", ())}
+    rows = [pair in spots for pair in zip(past["ids"].tolist(), past["until"].tolist(), strict=True)]
+    return {name: array[rows] for name, array in past.items()} if any(rows) else {}
+
+
 # ------------------------------------------------------------------ checks
 
 
