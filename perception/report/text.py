@@ -209,19 +209,26 @@ def state_counts(changes: Sequence[Mapping[str, Any]]) -> str:
 
 def changes_text(opened: QueryMap, since: int, guessed: Mapping[int, str]) -> str:
     """What changed since a visit, as a table, and what nobody looked at."""
-    changes, visits, metric = opened.changes(since), opened.visits, opened.metric
-    if len(visits) == 1:
+    if len(opened.visits) == 1:
         return f"{opened.path}: has one visit, so nothing is known to have changed; perception update adds another"
-    lines = [
-        f"{opened.path}: {date_of(visits, len(visits) - 1)} against {date_of(visits, since)}: {state_counts(changes)}",
-        *_aligned([_change_row(c, metric, guessed, visits) for c in changes if c["state"] in CHANGED]),
-    ]
-    for state, title in (("unseen", "not looked at"), ("unchanged", "unchanged")):
+    title, rows, rest = changes_parts(opened, since, guessed)
+    return "\n".join([f"{opened.path}: {title}", *_aligned([row for _, row in rows]), *rest])
+
+
+def changes_parts(
+    opened: QueryMap, since: int, guessed: Mapping[int, str]
+) -> tuple[str, list[tuple[dict[str, Any], list[str]]], list[str]]:
+    """Dates and counts; each change with its cells; and lines with what nobody looked at and what is as it was."""
+    changes, visits = opened.changes(since), opened.visits
+    title = f"{date_of(visits, len(visits) - 1)} against {date_of(visits, since)}: {state_counts(changes)}"
+    rows = [(c, _change_row(c, opened.metric, guessed, visits)) for c in changes if c["state"] in CHANGED]
+    lines = []
+    for state, heading in (("unseen", "not looked at"), ("unchanged", "unchanged")):
         rest = [c for c in changes if c["state"] == state]
         names = [f"{_name(c['instance_id'], c['label'], guessed)} [{c['instance_id']}]" for c in rest]
         seen = [f", last seen {date_of(visits, c['last_seen'])}" if state == "unseen" else "" for c in rest]
-        lines += [f"{title}: " + "; ".join(map(str.__add__, names, seen))] if rest else []
-    return "\n".join(lines)
+        lines += [f"{heading}: " + "; ".join(map(str.__add__, names, seen))] if rest else []
+    return title, rows, lines
 
 
 def _change_row(
