@@ -159,7 +159,7 @@ def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     info = read_info(args.map)
     entries = Map.open(args.map).instances
     texts = {entry["id"]: entry["texts"] for entry in entries if entry.get("texts")}
-    lines = [info_text(args.map, info, texts)]
+    lines = [info_text(args.map, info, entries)]
     info = {**info, "texts": texts} if texts else info
     if args.verify:
         info["verified"] = verify_map(args.map)

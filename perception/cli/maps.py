@@ -1,5 +1,5 @@
-"""What users ask of a finished map: `perception query`, `index`, `export`, `render`, `label`, `relink`, `upgrade`,
-`scale`."""
+"""What users ask of a finished map: `perception query`, `changes`, `index`, `export`, `render`, `label`, `relink`,
+`upgrade`, `scale`."""
 
 from __future__ import annotations
 
@@ -18,6 +18,11 @@ def register(commands: Any) -> None:
     p.add_argument("--top", type=int, default=20, metavar="K", help="at most so many hits of those that answer (20)")
     p.add_argument("--min-score", type=float, metavar="X", help="all with this score instead of those that answer")
     p.add_argument("--points", type=Path, metavar="OUT.ply", help="write the hits' points, labelled by instance_id")
+    p.add_argument("--at", metavar="VISIT", help="as of an earlier visit, by number; last: the one before the newest")
+    p = map_command(commands, "changes", _changes, "what moved, came and went since an earlier visit of the scene")
+    p.add_argument(
+        "--since", default="last", metavar="VISIT", help="by number; last (default): the one before the newest"
+    )
     p = command(commands, "index", _index, "many maps into one store, for query and serve as a map is")
     p.add_argument("maps", type=Path, nargs="*", metavar="MAP", help="maps that are new or may have changed")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="STORE")
@@ -72,20 +77,32 @@ def register(commands: Any) -> None:
 def _query(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.map.outputs import refuse_inputs
     from perception.query import load_map
+    from perception.query.hit import answer_json
     from perception.report.text import guessed_names, query_text, write_hits
 
     refuse_inputs([args.points], [args.map])
     opened = load_map(args.map)
-    answers = [(text, opened.query(text, args.top, args.min_score)) for text in args.text]
-    of_store = any(hit.map is not None for _, hits in answers for hit in hits)
+    opened = opened if args.at is None else opened.at(args.at)
+    ways = (opened.query, opened.gone)
+    answers = [(text, *(ask(text, args.top, args.min_score) for ask in ways)) for text in args.text]
+    of_store = any(hit.map is not None for _, hits, _ in answers for hit in hits)
     if args.points and of_store:
         raise InputError(f"{args.map}: is a store, whose maps have their own frames; give --points with one map")
     if args.points:
-        write_hits(args.points, [hit for _, hits in answers for hit in hits])
-    results = [{"text": text, "present": bool(hits), "hits": [h.to_json() for h in hits]} for text, hits in answers]
+        write_hits(args.points, [hit for _, hits, _ in answers for hit in hits])
+    results = [answer_json(*answer) for answer in answers]
     guessed = {} if args.json or of_store else guessed_names(opened)
-    shown = query_text(answers, opened.metric, guessed)
-    return {"results": results, "frame": opened.frame, "metric": opened.metric}, shown
+    shown = query_text(answers, opened.metric, guessed, opened.visits)
+    return {"results": results, "frame": opened.frame, "metric": opened.metric, **opened.visits_json()}, shown
+
+
+def _changes(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.query import load_map
+    from perception.report.text import changes_text, guessed_names
+
+    opened = load_map(args.map)
+    facts = opened.changes_json(args.since)
+    return facts, "" if args.json else changes_text(opened, facts["since"], guessed_names(opened))
 
 
 def _index(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

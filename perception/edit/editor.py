@@ -26,6 +26,7 @@ from perception.errors import InputError
 from perception.io.json_shapes import LARGEST
 from perception.language.description import InstanceDescription, from_arrays, to_arrays
 from perception.map.files import map_signature, read_info
+from perception.map.history import is_removed, joined_record, past_of
 from perception.map.map import Map, language_in, prefixed
 from perception.map.replace import writing
 from perception.map.write import read_map, write_map
@@ -131,6 +132,12 @@ class Editor:
                 return row
         raise InputError(f"instance {instance}: not in {self.path}; expected one of its {len(self.instances)} ids")
 
+    def _present_row(self, instance: int) -> int:
+        row = self._row(instance)
+        if is_removed(self.instances[row]):
+            raise InputError(f"instance {instance}: is gone, nothing of it stands there; choose another one")
+        return row
+
     @_step
     def current(self) -> Map:
         """The edited map."""
@@ -144,6 +151,7 @@ class Editor:
             language=to_arrays(now.descriptions, self._encoder) if self._encoder else {},
             parts=self._parts_now(),
             groups=self.original.groups if same else {},
+            past=past_of(self.original.past, now.instances),
         )
 
     def _parts_now(self) -> dict[str, np.ndarray]:
@@ -184,11 +192,12 @@ class Editor:
 
     @_step
     def merge(self, chosen: list[int]) -> int:
-        """Joins instances into one with a new id, which is returned; it keeps the first label among them."""
+        """Joins instances into one with a new id, which is returned; it keeps the first label among them. Where they
+        stood at earlier visits is dropped."""
         chosen = sorted(set(chosen))
         if len(chosen) < 2:
             raise InputError(f"merge: found {len(chosen)} instance, expected at least 2; choose another one to join")
-        rows = [self._row(instance) for instance in chosen]
+        rows = [self._present_row(instance) for instance in chosen]
         new = self._next_id()
         ids = np.where(np.isin(self.ids, chosen), new, self.ids).astype(np.int32)
         entries = [self.instances[row] for row in rows]
@@ -196,6 +205,7 @@ class Editor:
         label = next((entry["label"] for entry in entries if entry.get("label")), None)
         score = float(weights @ [entry["score"] for entry in entries] / weights.sum())
         merged = self._entry(new, ids, score, max(int(entry.get("views", 0)) for entry in entries), label)
+        merged |= joined_record(entries)
         if texts := [text for entry in entries for text in entry.get("texts", [])]:
             merged["texts"] = texts
         self._replace(f"merged {', '.join(map(str, chosen))} into {new}", rows, ids, [merged])
@@ -206,9 +216,9 @@ class Editor:
         """Splits an instance into new ones; returns their ids. Raises InputError when it cannot be split.
 
         The parts in the map's hierarchy are used where the instance has any. Otherwise its Gaussians alone are
-        clustered by their features again, with finer settings.
+        clustered by their features again, with finer settings. Where it stood at earlier visits is dropped.
         """
-        row = self._row(instance)
+        row = self._present_row(instance)
         own, entry = np.flatnonzero(self.ids == instance), self.instances[row]
         part = self._parts_of(entry, own)
         if part.max(initial=-1) < 1:
@@ -218,13 +228,14 @@ class Editor:
         known, means = part >= 0, self.original.means[own]
         ids[own] = np.where(known, part, part[known][cKDTree(means[known]).query(means)[1]]) + first
         new_ids = list(range(first, first + int(part.max()) + 1))
-        parts = [self._entry(new, ids, entry["score"], entry.get("views", 0)) for new in new_ids]
+        record = joined_record([entry])
+        parts = [self._entry(new, ids, entry["score"], entry.get("views", 0)) | record for new in new_ids]
         self._replace(f"split {instance} into {len(parts)}", [row], ids, parts)
         return new_ids
 
     @_step
     def remove(self, instance: int) -> None:
-        """Removes an instance from the list; its Gaussians stay and belong to no instance."""
+        """Removes an instance from the list, with its history; its Gaussians stay and belong to no instance."""
         ids = np.where(self.ids == instance, -1, self.ids).astype(np.int32)
         self._replace(f"removed {instance}", [self._row(instance)], ids, [])
 

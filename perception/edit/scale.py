@@ -51,7 +51,7 @@ def scale_map(path: Path, output: Path | None, options: FrameConfig, improve: bo
 
 
 def scaled(gmap: Map, factor: float) -> Map:
-    """The map with all lengths times `factor`: Gaussians, instances, parts and views.
+    """The map with all lengths times `factor`: Gaussians, instances with their history, parts and views.
     map.json's map_from_input is continued if the input had poses."""
     b_from_a = np.diag([factor, factor, factor, 1.0])
     info = dict(gmap.info)
@@ -61,9 +61,13 @@ def scaled(gmap: Map, factor: float) -> Map:
     def entry(old: dict[str, Any]) -> dict[str, Any]:
         new = {**old, "centroid": (factor * np.array(old["centroid"])).tolist()}
         new["obb"] = move_box(b_from_a, OrientedBox.from_json(old["obb"])).to_json()
-        new["aabb"] = {end: (factor * np.array(corner)).tolist() for end, corner in old.get("aabb", {}).items()}
-        if "parts" in old:
-            new["parts"] = [entry(part) for part in old["parts"]]
+        if "aabb" in old:
+            new["aabb"] = {end: (factor * np.array(corner)).tolist() for end, corner in old["aabb"].items()}
+        for key in ("parts", "past"):
+            if key in old:
+                new[key] = [entry(one) for one in old[key]]
+        if (motion := old.get("transform")) is not None:
+            new["transform"] = (b_from_a @ np.array(motion) @ np.linalg.inv(b_from_a)).tolist()
         return new
 
     return Map.of(
@@ -71,6 +75,7 @@ def scaled(gmap: Map, factor: float) -> Map:
         means=move_points(b_from_a, gmap.means),
         log_scales=(gmap.log_scales + np.log(factor)).astype(np.float32),
         instances=[entry(old) for old in gmap.instances],
+        past={**gmap.past, "means": move_points(b_from_a, gmap.past["means"])} if gmap.past else {},
         views=[moved(view, b_from_a) for view in gmap.views],
         info=info,
     )

@@ -19,6 +19,7 @@ from perception.language.base import Encoder, reading_of
 from perception.language.description import from_arrays, to_arrays
 from perception.language.encoders import make_encoder
 from perception.language.ocr import TextReader, make_reader
+from perception.map.history import stood
 from perception.map.map import MAX_SIDE, Map, language_in, prefixed
 from perception.map.replace import writing
 from perception.map.write import read_map, write_map
@@ -96,7 +97,8 @@ def _shown(
 ) -> tuple[list[np.ndarray], Load]:
     """The views that `stored` lists for each of the instances `ids`, and what loads them (see `describe_instances`).
 
-    owners: [N] instance id of each Gaussian, −1 = none. Raises InputError for a missing photo, before any is loaded.
+    owners: [N] instance id of each Gaussian, −1 = none. An instance that stood elsewhere when a photo was taken is
+    shown there by its recorded box. Raises InputError for a missing photo, before any is loaded.
     """
     descriptions, _ = from_arrays(stored)
     number = {view.name: n for n, view in enumerate(gmap.views)}
@@ -109,11 +111,18 @@ def _shown(
     gaussians, side = as_gaussians(gmap), gmap.setting("photos", "max_side", MAX_SIDE)
     rank = {instance: n for n, instance in enumerate(ids)}
     positions = np.array([rank.get(int(i), -1) for i in owners], np.int32)
+    entries = [entry for entry in gmap.instances if owners is gmap.instance_ids and entry.get("past")]
 
     def load(n: int) -> tuple[np.ndarray, np.ndarray]:
         view = training_view(located[n], side)
         height, width = view.photo.shape[:2]
         seen = render_silhouettes(gaussians, [positions], view.camera_from_world, view.K, width, height)[0]
+        for entry in entries:
+            row, name = rank[entry["id"]], gmap.views[n].name
+            if name in descriptions[row].views and stood(entry, getattr(gmap.views[n], "visit", 0)) is not entry:
+                x0, y0, x1, y1 = descriptions[row].boxes[descriptions[row].views.index(name)]
+                seen.ids[seen.ids == row] = -1
+                seen.ids[y0:y1, x0:x1] = row
         return view.photo.numpy(), seen.ids
 
     return [np.array([number[name] for name in d.views], np.int64) for d in descriptions], load

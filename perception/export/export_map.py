@@ -185,6 +185,9 @@ def _export_spz(map_path: Path, output: Path, points: Path | None) -> tuple[dict
     return {"spz": str(output), "gaussians": len(gmap), "bytes": size, "instance_ids": str(ids)}, text
 
 
+_RECORD = ("state", "last_seen")
+
+
 def at_granularity(gmap: Map, granularity: str) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
     """Ids [N] int32, −1 = none, and the entry of each id: of "parts" (and instances, for what is in none), "default",
     or "groups", with the id of the first of their `instances`. InputError where the map has no such level."""
@@ -281,7 +284,8 @@ def write_export(
 
     labels [P] int32, −1 = none; points, order and other columns are the cloud's own. instances: {id: {"score",
     "label"}} of the map.
-    Entries have "score", "label", "num_points"; those of parts also their `parent`, of groups the `instances` in them.
+    Entries have "score", "label", "num_points"; those of parts also their `parent`, of groups the `instances` in them,
+    in a map of several visits `state` and `last_seen`.
     facts: further keys of the sidecar.
     """
     rows = {}
@@ -289,7 +293,7 @@ def write_export(
     for i, n in zip(ids.tolist(), counts.tolist(), strict=True):
         known = instances.get(i, {})
         row = {"score": float(known.get("score", 1.0)), "label": known.get("label"), "num_points": n}
-        rows[str(i)] = row | {key: known[key] for key in ("parent", "instances") if key in known}
+        rows[str(i)] = row | {key: known[key] for key in ("parent", "instances", *_RECORD) if key in known}
     sidecar = {**(facts or {}), "instances": rows}
     with atomic_file(path.with_suffix(".json")) as new:
         new.write_text(json.dumps(sidecar, indent=1), encoding="utf-8")

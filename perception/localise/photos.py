@@ -16,12 +16,13 @@ from perception.inputs.readers import reader_of
 from perception.inputs.transforms import lens_values
 from perception.localise.localiser import Localised, NewPhoto
 from perception.photos.camera_file import read_camera
-from perception.photos.decode import SUFFIXES
+from perception.photos.decode import SUFFIXES, photo_size
 from perception.photos.folder import VIDEO_SUFFIXES, list_photos, view_name
 from perception.photos.view_json import absolute
 from perception.photos.views import fit_lens, view_lens
 from perception.progress import Progress
 from perception.sfm.options import ReadOptions
+from perception.types import Lens
 
 NO_POINTS = np.zeros((1, 3)), np.zeros((1, 3), np.uint8)
 """A cloud for readers of posed inputs, which else triangulate one."""
@@ -46,9 +47,17 @@ def new_photos(sources: Sequence[Path], camera: Path | None, workdir: Path, prog
         else:
             raise InputError(f"{source}: no photos found; expected .jpg, .heic, .png, .tif, .bmp or .webp files")
     if lens is not None:
-        found = [p if p.lens else replace(p, lens=fit_lens(lens, p.photo, Path(str(camera)))[0]) for p in found]
+        found = [p if p.lens else replace(p, lens=_fitted(lens, p.photo, camera)) for p in found]
     names = [photo.name for photo in found]
     return [p if names.count(p.name) == 1 else replace(p, name=str(p.photo)) for p in found]
+
+
+def _fitted(lens: Lens, photo: Path, camera: Path | None) -> Lens:
+    """The lens of a camera file at the size of a photo. InputError for a photo of another shape."""
+    if (fitted := fit_lens(lens, photo, as_stored=False)) is not None:
+        return fitted
+    found = "×".join(map(str, photo_size(photo)))
+    raise InputError(f"{photo}: the photo is {found}, the camera file {camera} says {lens.width}×{lens.height}")
 
 
 def transforms_of(found: Sequence[Localised], depths: dict[str, Any], output: Path, facts: dict[str, Any]) -> Any:

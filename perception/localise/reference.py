@@ -50,7 +50,8 @@ def open_reference(gmap: Map, locate: Locate, progress: Progress) -> Reference:
         views, rendered = _pictures(gmap, locate, Path(folder), progress)
         lenses, masks = [view_lens(view) for view in views], [view.mask for view in views]
         options = ReadOptions(Path(folder), progress=progress)
-        store = build_features([view.photo for view in views], list(lenses), options, masks, posed=True)
+        photos, stored = [view.photo for view in views], [view.as_stored for view in views]
+        store = build_features(photos, list(lenses), options, masks, posed=True, as_stored=stored)
         features = features_of(views, store)
         poses = poses_of(views)
         if len(features.pairs):

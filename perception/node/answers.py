@@ -38,6 +38,8 @@ POINTS = Channel("answer/points", "sensor_msgs/msg/PointCloud2")
 BOXES = Channel("answer/detections", "vision_msgs/msg/Detection3DArray")
 MARKS = Channel("answer/markers", "visualization_msgs/msg/MarkerArray")
 MAP_CLOUD = Channel("map/points", "sensor_msgs/msg/PointCloud2", latched=True)
+CHANGES = Channel("changes", "std_msgs/msg/String", latched=True)
+"""Output: JSON of `QueryMap.changes_json`, since the visit before the newest, with map_id and stamp."""
 HEALTH = Channel("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 """The topic on which ROS tools expect health (REP 107)."""
 
@@ -53,7 +55,7 @@ LOCALISE_POSE = Channel("localise/pose", "geometry_msgs/msg/PoseWithCovarianceSt
 LOCALISE_ANSWER = Channel("localise/answer", "std_msgs/msg/String")
 """Output, with the image's stamp: the camera's pose in the map's frame; JSON, also of an image that has no pose."""
 
-OUTPUTS = (ANSWER, POINTS, BOXES, MARKS, MAP_CLOUD, HEALTH, LOCALISE_POSE, LOCALISE_ANSWER)
+OUTPUTS = (ANSWER, POINTS, BOXES, MARKS, MAP_CLOUD, CHANGES, HEALTH, LOCALISE_POSE, LOCALISE_ANSWER)
 
 DEPTH = 64
 """Largest number of messages queued for a slow reader; older ones are dropped, which bounds the memory."""

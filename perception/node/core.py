@@ -104,7 +104,7 @@ class Core:
         engine.on_reload(lambda _: self._submit(self._send_map))
 
     def start(self) -> None:
-        """Publishes the point cloud of the map."""
+        """Publishes the map's changes and its point cloud."""
         self._submit(self._send_map)
 
     # ------------------------------------------------------------------ topics
@@ -140,8 +140,8 @@ class Core:
         self._refused[body["error"]["kind"]] += 1
         self._send_json({**body, "stamp": answers.stamp_json(self._stamps.next())})
 
-    def _send_json(self, value: Message) -> None:
-        self._transport.publish(answers.ANSWER, {"data": json.dumps(value, allow_nan=False)})
+    def _send_json(self, value: Message, topic: answers.Channel = answers.ANSWER) -> None:
+        self._transport.publish(topic, {"data": json.dumps(value, allow_nan=False)})
 
     # ---------------------------------------------------------------- services
 
@@ -203,10 +203,13 @@ class Core:
         self._transport.publish(answers.HEALTH, body)
 
     def _send_map(self, gmap: QueryMap) -> None:
-        if not self._config.map_points:
-            return
         with self._sending_map:
-            if gmap is self._engine.current:  # else a newer map is published soon
+            if gmap is not self._engine.current:  # a newer map is published soon
+                return
+            if gmap.visits:
+                facts = {**gmap.changes_json(), "map_id": gmap.map_id}
+                self._send_json({**facts, "stamp": answers.stamp_json(self._stamps.next())}, answers.CHANGES)
+            if self._config.map_points:
                 cloud = answers.map_cloud(gmap, self._config.map_points, self._stamps.next())
                 self._transport.publish(answers.MAP_CLOUD, cloud)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,6 @@ import numpy as np
 from perception.io.atomic import atomic_file
 from perception.photos.decode import decode, nearest, open_photo, reduced_size, to_rgb, upright
 from perception.photos.ignore_masks import read_mask
-from perception.photos.lens import same_aspect
 from perception.progress import Progress
 
 SIDE, SAMPLE = 320, 64
@@ -69,13 +69,19 @@ class Still:
 
 
 def with_still(
-    photos: list[Path], sizes: list[tuple[int, int]], masks: list[Path | None], folder: Path | None, progress: Progress
+    photos: list[Path],
+    sizes: list[tuple[int, int]],
+    masks: list[Path | None],
+    folder: Path | None,
+    progress: Progress,
+    as_stored: Sequence[bool] | None = None,
 ) -> Still:
     """The masks of `photos` with what stays in the pictures of each camera, which are those of one folder and size.
     sizes: (width, height) of the photos as they are used. folder: for the new masks, named by their content; None
-    uses all as they are."""
+    uses all as they are. as_stored: of each photo, whether its EXIF rotation is not applied; None: it is."""
     if folder is None:
         return Still(masks, {})
+    stored = as_stored or [False] * len(photos)
     cameras: dict[tuple[Path, tuple[int, int]], list[int]] = {}
     for index, (photo, size) in enumerate(zip(photos, sizes, strict=True)):
         cameras.setdefault((photo.parent, size), []).append(index)
@@ -85,7 +91,7 @@ def with_still(
         if len(members) < FEWEST:
             continue
         some = np.unique(np.linspace(0, len(members) - 1, SAMPLE).round().astype(int))
-        used = ~still_pixels(np.stack([_small(photos[members[k]], size) for k in some]))
+        used = ~still_pixels(np.stack([_small(photos[members[k]], size, stored[members[k]]) for k in some]))
         if used.all():
             continue
         found, count, ignored = [*found, used], count + len(members), ignored + len(members) * float(1 - used.mean())
@@ -99,15 +105,14 @@ def with_still(
     return Still(masks, {"photos": count, "share": round(ignored / count, 4), "mask": code})
 
 
-def _small(photo: Path, size: tuple[int, int]) -> np.ndarray:
+def _small(photo: Path, size: tuple[int, int], as_stored: bool) -> np.ndarray:
     """A photo of `size` as grey [h, w] uint8 with a long side of SIDE pixels; JPEG is decoded at a reduced size."""
     scale = min(1.0, SIDE / max(size))
     width, height = (max(1, round(scale * side)) for side in size)
     with open_photo(photo) as image:
         image.draft("RGB", reduced_size(*image.size, max(1, int(min(image.size) / (2 * SIDE)))))
         decode(image, photo)
-        turned = upright(image, photo)
-        picture = to_rgb(turned if same_aspect(turned.size, size) else image, photo)
+        picture = to_rgb(image if as_stored else upright(image, photo), photo)
     return cv2.resize(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (width, height), interpolation=cv2.INTER_AREA)
 
 

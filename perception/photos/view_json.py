@@ -2,7 +2,8 @@
 
 name, K, width, height, camera_from_world, lens, held_out: as in `types.View`. photo: absolute path of the photo.
 photo_beside: its path relative to the map's folder. photo_bytes: its size in bytes; a file of another size is not
-accepted. The last two may be null. as_stored: true where EXIF rotation is not applied.
+accepted. The last two may be null. as_stored: true where EXIF rotation is not applied. visit: number of the visit that
+took it (see `map.history`), 0 when it is missing.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from perception.errors import InputError
 from perception.io.atomic import pointed
 from perception.io.json_shapes import (
     Bytes,
+    Count,
     Intrinsics,
     Number,
     PathText,
@@ -49,7 +51,7 @@ _GAIN = Annotated[list[Annotated[float, Field(gt=0, lt=1e3)]], Len(3, 3)]
 _VIEW = {
     "name": PhotoName, "photo": PathText, "K": Intrinsics, "width": Side, "height": Side, "camera_from_world": Pose,
     "lens?": _LENS | None, "held_out?": bool, "photo_beside?": PathText | None, "photo_bytes?": Bytes | None,
-    "depth?": _DEPTH | None, "mask?": PathText | None, "gain?": _GAIN | None, "as_stored?": bool,
+    "depth?": _DEPTH | None, "mask?": PathText | None, "gain?": _GAIN | None, "as_stored?": bool, "visit?": Count,
 }  # fmt: skip
 VIEW: Any = Annotated[typed(_VIEW), AfterValidator(_pixels)]
 """A view in map.json."""
@@ -61,27 +63,15 @@ class StoredView(View):
 
     photo_beside: str | None = None
     photo_bytes: int | None = None
+    visit: int = 0
 
 
-def stored_view(view: View, folder: Path, held_out: bool = False) -> StoredView:
+def stored_view(view: View, folder: Path, held_out: bool = False, visit: int = 0) -> StoredView:
     """`view` with the record of its photo for the map at `folder`: both paths, and the size (None if missing)."""
     photo = absolute(view.photo)  # links are kept: the user names his photos by them
     K, pose = np.asarray(view.K, np.float64), np.asarray(view.camera_from_world, np.float64)
-    own = (
-        view.name,
-        photo,
-        K,
-        view.width,
-        view.height,
-        pose,
-        view.lens,
-        held_out,
-        None,
-        None,
-        view.gain,
-        view.as_stored,
-    )
-    return StoredView(*own, _relative(photo, folder), _bytes(photo))
+    own = (view.name, photo, K, view.width, view.height, pose, view.lens, held_out, None, None, view.gain)
+    return StoredView(*own, view.as_stored, _relative(photo, folder), _bytes(photo), visit)
 
 
 def moved_record(view: StoredView, before: Path, after: Path) -> StoredView:
@@ -136,6 +126,7 @@ def view_json(view: View) -> dict[str, Any]:
     }
     if isinstance(view, StoredView):
         entry |= {name: getattr(view, name) for name in ("held_out", "photo_beside", "photo_bytes")}
+        entry |= {"visit": view.visit} if view.visit else {}
     elif view.held_out:
         entry["held_out"] = True
     if view.as_stored:
@@ -168,6 +159,7 @@ def view_from_json(entry: dict[str, Any]) -> StoredView:
         entry.get("as_stored", False),
         beside,
         size,
+        entry.get("visit", 0),
     )
 
 

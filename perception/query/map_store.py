@@ -105,6 +105,16 @@ class MapStore:
             return str(error)
         return None
 
+    visits = ()
+
+    def visits_json(self) -> dict[str, Any]:
+        """Nothing: the visits of its maps are not held."""
+        return {}
+
+    def gone(self, *_: Any, **__: Any) -> list[Hit]:
+        """Nothing: what is gone is not held; ask one map for it."""
+        return []
+
     def warm(self) -> None:
         if self.problem is None:
             self.query("thing")

@@ -25,14 +25,17 @@ from perception.instances.crops import expand_box, mask_box
 from perception.instances.silhouettes import render_silhouettes
 from perception.io.atomic import atomic_file
 from perception.map.files import read_info
+from perception.map.history import stood
 from perception.map.map import MAX_SIDE, Map
 from perception.map.write import REPORT
 from perception.photos.decode import load_photo, scaled_K
 from perception.pictures import error_map, features_to_rgb, outline, overlay, titled_row
 from perception.progress import Progress
 from perception.query import QueryMap, load_map
+from perception.query.crops import cut_out
 from perception.query.hit import printed_texts
-from perception.report.text import depth_figures
+from perception.query.spatial_index import CORNERS
+from perception.report.text import changes_parts, depth_figures, guessed_names
 
 SHOWN = ("worst", "middle", "best")
 """Held-out views shown beside their photos, by PSNR."""
@@ -62,6 +65,7 @@ def write_map_report(opened: QueryMap, path: Path, queries: list[str]) -> Path:
         "seconds": {name: value for name, value in info.get("seconds", {}).items() if name != "total" and value > 0},
         "views": _view_rows(album),
         "overview": _overview(opened, album),
+        "changes": _changes(opened, album),
         "instances": _instance_rows(opened, album),
         "metric": opened.metric,
         "queries": [_query_row(opened, text, album) for text in queries],
@@ -184,6 +188,23 @@ class _Album:
         """[h, w] instance ids rendered from the camera of the photo, −1 = none."""
         return render_silhouettes(self.gaussians, [self.gmap.instance_ids], *self._camera(name))[0].ids
 
+    def spot(self, box: dict[str, Any], first: int, last: int) -> np.ndarray | None:
+        """The photo of the visits `first` to `last` on which the box, as in instances.json, is largest, cut out with a
+        margin; None when none shows all of it."""
+        corners = np.array(box["center"]) + CORNERS * np.array(box["extent"]) @ np.array(box["rotation"])
+        boxes = []
+        for name, view in self.views.items():
+            x, y, depth = view.camera_from_world[:3, :3] @ corners.T + view.camera_from_world[:3, 3:]
+            if first <= getattr(view, "visit", 0) <= last and depth.min() > 0:
+                u, v = (view.K[:2, :2] @ [x, y] / depth + view.K[:2, 2:]) / [[view.width], [view.height]]
+                if min(*u, *v) >= 0 and max(*u, *v) <= 1:
+                    boxes.append((float(np.ptp(u) * np.ptp(v)), name, (u.min(), v.min(), u.max(), v.max())))
+        for _, name, shares in sorted(boxes, reverse=True):
+            if (photo := self.photo(name)) is not None:
+                x0, y0, x1, y1 = (int(share * side) for share, side in zip(shares, photo.shape[1::-1] * 2, strict=True))
+                return cut_out(photo, (x0, y0, x1, y1), SIZES[0][0])
+        return None
+
     def features(self, name: str) -> np.ndarray:
         """[h, w, 3] uint8: rendered features, first three principal components as RGB."""
         out = render(self.gaussians, *self._camera(name), features=self.gaussians.features)
@@ -268,6 +289,22 @@ def _best_picture(opened: QueryMap, index: int, album: _Album, cropped: bool) ->
         return picture
     x0, y0, x1, y1 = expand_box(mask_box(mask) or (0, 0, *mask.shape[::-1]), 0.15, *mask.shape[::-1])
     return picture[y0:y1, x0:x1]
+
+
+def _changes(opened: QueryMap, album: _Album) -> dict[str, Any]:
+    """What changed since the visit before the newest, with photos of the spots from before and after; {} for a map of
+    one visit."""
+    if not opened.newest_visit:
+        return {}
+    since = opened.newest_visit - 1
+    title, rows, rest = changes_parts(opened, since, guessed_names(opened))
+    entries, shown = {entry["id"]: entry for entry in opened.record.instances}, []
+    for change, cells in rows:
+        entry = entries[change["instance_id"]]
+        then = stood(entry, since) or entry
+        pictures = album.spot(then["obb"], 0, since), album.spot(entry["obb"], since + 1, opened.newest_visit)
+        shown.append({"id": entry["id"], "pictures": pictures, "cells": cells})
+    return {"title": title, "rows": shown, "rest": rest}
 
 
 def _instance_rows(opened: QueryMap, album: _Album) -> list[dict[str, Any]]:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from perception.map.checksums import IGNORED
+from perception.map.history import STATES, Visit, changes_of, date_of, is_removed, visits_of
 from perception.query import Hit, QueryMap
+from perception.query.hit import printed_texts
 
 
 def map_facts(path: Path | str, info: dict[str, Any]) -> dict[str, Any]:
@@ -32,20 +36,23 @@ def shares(training: dict[str, Any]) -> dict[str, float]:
     return {name: round(seconds / total, 4) for name, seconds in sorted(parts.items(), key=lambda part: -part[1])}
 
 
+CHANGED = STATES[:3]
+"""The states of things that are not as they were."""
 SHARP, BLURRED = 25.0, 20.0
 """Held-out PSNR in dB from which a map is called sharp, and below which poor."""
 
 
-def info_text(path: Path, info: dict[str, Any], texts: dict[int, list[dict[str, Any]]] | None = None) -> str:
+def info_text(path: Path, info: dict[str, Any], entries: Sequence[dict[str, Any]] = ()) -> str:
     """Summary of map.json as text, for `perception info`: what the map is, how good it is, what to do next, then its
-    details. texts: those printed on each instance, by its id."""
+    details. entries: those of instances.json."""
     quality, training, scene = info.get("quality", {}), info.get("training", {}), info.get("scene", {})
     seconds, trained = info.get("seconds", {}), max(training.get("seconds", 0.0), 1e-9)
     left_out = [f"left out: {entry['name']} ({entry['why']})" for entry in scene.get("left_out", [])]
     warnings = [f"warning: {text}" for text in scene.get("warnings", [])]
+    count = info["num_instances"] - sum(map(is_removed, entries))
     unit = "in metres" if info.get("metric") else "without a metric scale"
     lines = [
-        f"{path}: {info['num_instances']} instances in {info['num_gaussians']:,} Gaussians, "
+        f"{path}: {count} instances in {info['num_gaussians']:,} Gaussians, "
         f"from {len(info.get('views', []))} photos, {unit}",
         _verdict(quality, len(left_out), len(warnings)),
         "next: " + _next_step(path, info),
@@ -58,11 +65,17 @@ def info_text(path: Path, info: dict[str, Any], texts: dict[int, list[dict[str, 
     if still := scene.get("still"):
         what = f"{still['share']:.1%} of the pixels of {still['photos']} photos"
         lines.append(f"ignored, as it stays in the picture while the camera moves: {what} ({path / IGNORED})")
+    if visits := info.get("visits"):
+        dates, newest = visits_of(info), len(visits) - 1
+        states = state_counts(changes_of(dates, list(entries), max(newest - 1, 0)))
+        lines.append(
+            f"visits: {len(visits)}, the newest on {date_of(dates, newest)} ({states}); perception changes {path}"
+        )
     if training.get("profile"):
         lines.append("of training: " + ", ".join(f"{name} {share:.0%}" for name, share in shares(training).items()))
     if depth := info.get("depth"):
         lines.append(f"depth images: {depth['views']}, measured in {depth['measured']:.0%} of their pixels")
-    lines += [f"printed on {i}: " + ", ".join(f'"{e["text"]}"' for e in read) for i, read in (texts or {}).items()]
+    lines += [f"printed on {e['id']}: {', '.join(printed_texts(e))}" for e in entries if e.get("texts")]
     lines += [f"decision: {text}" for text in training.get("decisions", [])]
     return "\n".join([*lines, *left_out, *warnings])
 
@@ -119,40 +132,128 @@ def depth_text(errors: dict[str, Any]) -> str:
 
 
 def query_text(
-    answers: list[tuple[str, list[Hit]]], metric: bool | None, guessed: Mapping[int, str] | None = None
+    answers: Sequence[tuple[str, list[Hit], list[Hit]]],
+    metric: bool | None,
+    guessed: Mapping[int, str] | None = None,
+    visits: Sequence[Visit] = (),
 ) -> str:
-    """Ranked hits of each prompt in aligned columns, or "not present". metric: whether positions are in metres.
-    guessed: instance id -> likely name, for instances that nobody has named."""
-    lines = []
-    for text, hits in answers:
+    """Ranked hits of each prompt in aligned columns, or "not present", and what answers it and is gone. metric: whether
+    positions are in metres. guessed: instance id -> likely name, for instances that nobody has named."""
+    lines, names = [], guessed or {}
+    for text, hits, gone in answers:
         lines.append(f'"{text}": {f"{len(hits)} found" if hits else "not present"}')
-        rows = [_hit_row(rank, hit, metric, guessed or {}) for rank, hit in enumerate(hits, start=1)]
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        lines += ["  " + "  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+        rows = [_hit_row(f"{rank}.", hit, metric, names, visits) for rank, hit in enumerate(hits, start=1)]
+        lines += _aligned(rows + [_hit_row("gone:", hit, metric, names, visits) for hit in gone])
     return "\n".join(lines)
 
 
+def _aligned(rows: list[list[str]]) -> list[str]:
+    """Rows of cells as lines with aligned columns."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  " + "  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+
+
 def guessed_names(opened: QueryMap) -> dict[int, str]:
-    """Instance id -> likeliest name; empty without an encoder."""
-    if opened.problem is not None:
+    """Instance id -> likeliest name, also of what is gone; empty without an encoder."""
+    known = opened.last_known
+    if known.problem is not None:
         return {}
-    pairs = zip(opened.instances, opened.likely_names(1), strict=True)
+    pairs = zip(known.instances, known.likely_names(1), strict=True)
     return {int(entry["id"]): names[0] for entry, names in pairs if names}
 
 
-def _hit_row(rank: int, hit: Hit, metric: bool | None, guessed: Mapping[int, str]) -> list[str]:
-    """Rank, name, score, position, size and id of a hit, as the cells of a row."""
+def _name(instance_id: int, label: str | None, guessed: Mapping[int, str]) -> str:
+    return label or (f"{guessed[instance_id]} (guessed)" if instance_id in guessed else "no name")
+
+
+def _position(point: Sequence[float] | np.ndarray, metric: bool | None) -> str:
+    x, y, z = point
+    return f"{x:.2f} {y:.2f} {z:.2f} m" if metric else f"{x:.3f} {y:.3f} {z:.3f}"
+
+
+def _hit_row(
+    rank: str, hit: Hit, metric: bool | None, guessed: Mapping[int, str], visits: Sequence[Visit]
+) -> list[str]:
+    """Rank, name, score, position, size, id and visits of a hit, as the cells of a row."""
     in_metres = metric if hit.metric is None else hit.metric
-    name = hit.label or (f"{guessed[hit.instance_id]} (guessed)" if hit.instance_id in guessed else "no name")
-    x, y, z = hit.centroid
-    scale, unit, length = (100.0, " cm", " m") if in_metres else (1.0, "", "")
+    name = _name(hit.instance_id, hit.label, guessed)
+    scale, unit = (100.0, " cm") if in_metres else (1.0, "")
     sides = " x ".join(f"{scale * side:.{0 if in_metres else 3}f}" for side in hit.obb.extent)
     ident = f"instance {hit.instance_id}"
     ident += "" if hit.part is None else f", part {hit.part}"
     ident += f", together {', '.join(map(str, hit.instances))}" if hit.instances else ""
     ident += "" if hit.map is None else f" in {hit.map}"
-    position = f"at {x:.2f} {y:.2f} {z:.2f}{length}" if in_metres else f"at {x:.3f} {y:.3f} {z:.3f}"
-    return [f"{rank}.", name, f"score {hit.score:.2f}", position, f"size {sides}{unit}", ident]
+    history = [] if hit.state is None or not visits else _history(hit, in_metres, guessed, visits)
+    position = f"{'stood' if hit.state == 'removed' else 'at'} {_position(hit.centroid, in_metres)}"
+    return [rank, name, f"score {hit.score:.2f}", position, f"size {sides}{unit}", ident, "; ".join(history)]
+
+
+def _history(hit: Hit, metric: bool | None, guessed: Mapping[int, str], visits: Sequence[Visit]) -> list[str]:
+    """What the visits tell of a hit: since when it is there or gone, where it was, when it was seen last."""
+    since, newest, phrases = date_of(visits, hit.since or 0), len(visits) - 1, []
+    if hit.state == "removed":
+        phrases.append(f"gone since {since}")
+        if hit.stood is not None:
+            relation, other = hit.stood
+            phrases[-1] += f", stood {relation} {_name(other, None, guessed)} (instance {other})"
+    elif hit.was is not None:
+        phrases.append(f"here since {since}, before at {_position(hit.was, metric)}")
+    elif hit.state == "added":
+        phrases.append(f"new on {since}")
+    if hit.last_seen is not None and hit.last_seen < newest:
+        phrases.append(f"last seen {date_of(visits, hit.last_seen)}")
+    return phrases
+
+
+def state_counts(changes: Sequence[Mapping[str, Any]]) -> str:
+    """How many things are in each state: "1 moved, 2 removed, 0 added, 9 unchanged, 3 not looked at"."""
+    counts = Counter(change["state"] for change in changes)
+    return ", ".join(f"{counts[state]} {state.replace('unseen', 'not looked at')}" for state in STATES)
+
+
+def changes_text(opened: QueryMap, since: int, guessed: Mapping[int, str]) -> str:
+    """What changed since a visit, as a table, and what nobody looked at."""
+    if len(opened.visits) == 1:
+        return f"{opened.path}: has one visit, so nothing is known to have changed; perception update adds another"
+    title, rows, rest = changes_parts(opened, since, guessed)
+    return "\n".join([f"{opened.path}: {title}", *_aligned([row for _, row in rows]), *rest])
+
+
+def changes_parts(
+    opened: QueryMap, since: int, guessed: Mapping[int, str]
+) -> tuple[str, list[tuple[dict[str, Any], list[str]]], list[str]]:
+    """Dates and counts; each change with its cells; and lines with what nobody looked at and what is as it was."""
+    changes, visits = opened.changes(since), opened.visits
+    title = f"{date_of(visits, len(visits) - 1)} against {date_of(visits, since)}: {state_counts(changes)}"
+    rows = [(c, _change_row(c, opened.metric, guessed, visits)) for c in changes if c["state"] in CHANGED]
+    lines = []
+    for state, heading in (("unseen", "not looked at"), ("unchanged", "unchanged")):
+        rest = [c for c in changes if c["state"] == state]
+        names = [f"{_name(c['instance_id'], c['label'], guessed)} [{c['instance_id']}]" for c in rest]
+        seen = [f", last seen {date_of(visits, c['last_seen'])}" if state == "unseen" else "" for c in rest]
+        lines += [f"{heading}: " + "; ".join(map(str.__add__, names, seen))] if rest else []
+    return title, rows, lines
+
+
+def _change_row(
+    change: Mapping[str, Any], metric: bool | None, guessed: Mapping[int, str], visits: Sequence[Visit]
+) -> list[str]:
+    """State, name, id, confidence, positions and dates of a change, as the cells of a row."""
+    old, new, number = change["old_centroid"], change["new_centroid"], change["instance_id"]
+    parts = [f"{'from' if new else 'stood at'} {_position(old, metric)}"] if old else []
+    parts += [f"to {_position(new, metric)}"] if old and new else [f"at {_position(new, metric)}"] if new else []
+    if old and new:
+        length = float(np.linalg.norm(np.subtract(new, old)))
+        parts.append(f"by {100 * length:.0f} cm" if metric else f"by {length:.3f}")
+    if change["transform"] is not None:
+        rotation = Rotation.from_matrix(np.array(change["transform"])[:3, :3])
+        parts.append(f"turned {np.degrees(rotation.magnitude()):.0f}°")
+    if change["state"] == "removed":
+        parts.append(f"last seen {date_of(visits, change['last_seen'])}")
+    sure = "" if change["confidence"] is None else f"confidence {change['confidence']:.2f}"
+    note = "cannot be told from another thing or motion" if change.get("ambiguous") else ""
+    name = _name(number, change["label"], guessed)
+    return [change["state"], name, f"instance {number}", sure, ", ".join(parts), note]
 
 
 def write_hits(path: Path, hits: list[Hit]) -> None:

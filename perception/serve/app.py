@@ -46,6 +46,8 @@ def encode(gmap: QueryMap, instance_id: int, kind: str) -> bytes:
 
 T = TypeVar("T")
 MapId = Annotated[str | None, Query(description="answer only from this very map, else 409")]
+At = Annotated[int | None, Query(ge=0, lt=10**9, description="as of this visit; else today")]
+Since = Annotated[int | None, Query(ge=0, lt=10**9, description="a visit; else the one before the newest")]
 Id = Annotated[int, Path(alias="id", ge=0, lt=10**9)]
 _ABOUT = (
     "Text prompts and positions in, 3D instances of a map out. Lengths are in the unit of the map's frame, metres when "
@@ -79,19 +81,20 @@ class MapQueries:
 
     engine: QueryEngine
 
-    async def result(self, map_id: str | None, work: Callable[[QueryMap], T]) -> T:
-        """What `work` returns."""
-        return await self.engine.awaited(self.engine.run(work, map_id=map_id))
+    async def result(self, map_id: str | None, at: int | None, work: Callable[[QueryMap], T]) -> T:
+        """What `work` returns of the map as of the visit `at`, None = today."""
+        future = self.engine.run(lambda gmap: work(gmap if at is None else gmap.at(at)), map_id=map_id)
+        return await self.engine.awaited(future)
 
     async def hits(
-        self, map_id: str | None, frame: Frame | None, work: Callable[[QueryMap], Sequence[Hit]]
+        self, map_id: str | None, at: int | None, frame: Frame | None, work: Callable[[QueryMap], Sequence[Hit]]
     ) -> Response:
         """The hits that `work` finds, in `frame`."""
 
         def answer(gmap: QueryMap) -> dict[str, Any]:
-            return {"hits": [hit.to_json() for hit in work(gmap)], **source(gmap, frame)}
+            return {"hits": [hit.to_json() for hit in work(gmap)], **source(gmap, frame), **gmap.visits_json()}
 
-        return JSONResponse(await self.result(map_id, answer))
+        return JSONResponse(await self.result(map_id, at, answer))
 
 
 def add_localising(app: FastAPI, queries: MapQueries, settings: ServeSettings) -> None:
@@ -105,7 +108,7 @@ def add_localising(app: FastAPI, queries: MapQueries, settings: ServeSettings) -
         def work(gmap: QueryMap) -> dict[str, Any]:
             return {**body.answered(gmap, settings.photos), **source(gmap, frame)}
 
-        return JSONResponse(await queries.result(map_id, work))
+        return JSONResponse(await queries.result(map_id, None, work))
 
 
 def add_state(app: FastAPI, engine: QueryEngine) -> None:
@@ -135,22 +138,22 @@ def add_searches(app: FastAPI, queries: MapQueries) -> None:
 
         def work(gmap: QueryMap) -> dict[str, Any]:
             results = [request.answered(gmap, time.monotonic()).to_json() for request in requests]
-            return {"results": results, **source(gmap, requests[0].frame)}
+            return {"results": results, **source(gmap, requests[0].frame), **gmap.visits_json()}
 
-        return JSONResponse(await queries.result(map_id, work))
+        return JSONResponse(await queries.result(map_id, None, work))
 
     @app.post("/find")
     async def find(body: FindBody, map_id: MapId = None) -> Response:
         """All instances that fulfil a filter."""
         where, frame = body.query_where(), body.query_frame()
-        return await queries.hits(map_id, frame, lambda gmap: gmap.find(where, frame=frame))
+        return await queries.hits(map_id, body.at, frame, lambda gmap: gmap.find(where, frame=frame))
 
     @app.post("/nearest")
     async def nearest(body: NearestBody, map_id: MapId = None) -> Response:
         """The instances nearest to a point or pose."""
         where, frame, near = body.query_where(), body.query_frame(), np.array(body.near)
         return await queries.hits(
-            map_id, frame, lambda gmap: gmap.nearest(near, body.top_k or 1, where=where, frame=frame)
+            map_id, body.at, frame, lambda gmap: gmap.nearest(near, body.top_k or 1, where=where, frame=frame)
         )
 
     @app.post("/at")
@@ -162,26 +165,40 @@ def add_searches(app: FastAPI, queries: MapQueries) -> None:
             hit = gmap.instance_at(np.array(body.point), max_distance=body.max_distance, frame=frame)
             return [] if hit is None else [hit]
 
-        return await queries.hits(map_id, frame, work)
+        return await queries.hits(map_id, body.at, frame, work)
 
 
 def add_instances(app: FastAPI, queries: MapQueries) -> None:
     """The routes of the map's instances."""
 
     @app.get("/instances")
-    async def instances(map_id: MapId = None) -> Response:
+    async def instances(map_id: MapId = None, at: At = None) -> Response:
         """All instances."""
-        return await queries.hits(map_id, None, lambda gmap: gmap.find())
+        return await queries.hits(map_id, at, None, lambda gmap: gmap.find())
+
+    @app.get("/changes")
+    async def changes(map_id: MapId = None, since: Since = None) -> Response:
+        """What moved, came and went since an earlier visit, and what nobody looked at."""
+
+        def work(gmap: QueryMap) -> dict[str, Any]:
+            return {**gmap.changes_json("last" if since is None else since), **source(gmap)}
+
+        return JSONResponse(await queries.result(map_id, None, work))
 
     @app.get("/instances/{id}")
-    async def describe(number: Id, map_id: MapId = None) -> Response:
+    async def describe(number: Id, map_id: MapId = None, at: At = None) -> Response:
         """One instance."""
-        answer = await queries.result(map_id, lambda gmap: {**gmap.describe(number).to_json(), **source(gmap)})
-        return JSONResponse(answer)
+
+        def work(gmap: QueryMap) -> dict[str, Any]:
+            return {**gmap.describe(number).to_json(), **source(gmap), **gmap.visits_json()}
+
+        return JSONResponse(await queries.result(map_id, at, work))
 
     @app.get("/instances/{id}/points", response_class=Response)
-    async def points(number: Id, map_id: MapId = None, format: Literal["npz", "ply"] = "npz") -> Response:
+    async def points(
+        number: Id, map_id: MapId = None, at: At = None, format: Literal["npz", "ply"] = "npz"
+    ) -> Response:
         """The instance's points, float32, in the map's frame; the header X-Map-Id names the map."""
-        made_by, data = await queries.result(map_id, lambda gmap: (gmap.map_id, encode(gmap, number, format)))
+        made_by, data = await queries.result(map_id, at, lambda gmap: (gmap.map_id, encode(gmap, number, format)))
         name = f'attachment; filename="instance_{number}.{format}"'
         return Response(data, media_type=FORMATS[format], headers={"X-Map-Id": made_by, "Content-Disposition": name})

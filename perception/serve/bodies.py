@@ -27,6 +27,7 @@ Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
 Rotation = Annotated[list[Point], Field(min_length=3, max_length=3)]
 Matrix = Annotated[list[Annotated[list[Number], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)]
 Text = Annotated[str, Field(max_length=MAX_TEXT)]  # with a bound, pydantic also rejects lone surrogates
+Visit = Annotated[int, Field(ge=0, lt=10**9)]
 Prompt = Annotated[str, Field(min_length=1, max_length=MAX_TEXT)]
 
 
@@ -110,9 +111,10 @@ class FrameBody(Body):
 
 
 class FramedBody(Body):
-    """What all questions share: the frame that the question and its answer are in."""
+    """What all questions share: the frame that question and answer are in, and the visit as of which it is answered."""
 
     frame: FrameBody | None = None
+    at: Visit | None = None
 
     def query_frame(self) -> Frame | None:
         return None if self.frame is None else self.frame.frame()
@@ -138,7 +140,7 @@ class QueryBody(FilteredBody):
         """One Request for each prompt."""
         texts = self.text if isinstance(self.text, list) else [self.text]
         where, frame, top_k = self.query_where(), self.query_frame(), self.top_k or TOP
-        return [Request(text, top_k, self.min_score, where, frame) for text in texts]
+        return [Request(text, top_k, self.min_score, where, frame, self.at) for text in texts]
 
 
 class FindBody(FilteredBody):

@@ -17,7 +17,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import cv2
 import numpy as np
-from pydantic import BaseModel, Discriminator, Field, Tag
+from pydantic import Discriminator, Field, Tag
 from scipy.spatial import cKDTree
 
 from perception import __version__
@@ -29,7 +29,15 @@ from perception.query.hit import printed_texts
 from perception.query.requests import MAX_TOP
 from perception.query.robot_pose import where_to_stand
 from perception.query.scene_graph import scene_graph
-from perception.serve.bodies import AnyRegion, Body, FrameBody, Length, PointOrPose, Prompt, Text, parse
+from perception.serve.answers import (
+    Answer,
+    ChangesAnswer,
+    DescribeAnswer,
+    InstancesAnswer,
+    MeasureAnswer,
+    PoseAnswer,
+)
+from perception.serve.bodies import AnyRegion, Body, FrameBody, Length, PointOrPose, Prompt, Text, Visit, parse
 from perception.serve.engine import QueryEngine
 from perception.serve.localise import GivenPhoto, Place
 from perception.serve.requests import MAX_PICTURE, NoScale, ServeSettings, UnknownFrame, error_kind, error_line, source
@@ -56,59 +64,6 @@ Framed = Annotated[
     Annotated[Text, Tag("single")] | Annotated[FrameBody, Tag("nested")],
     Discriminator(lambda value: "single" if isinstance(value, str) else "nested"),
 ]
-Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
-
-
-class Answer(BaseModel):
-    map_id: str
-    frame: str = Field(description="frame of all coordinates")
-    metric: bool = Field(description="whether lengths are metres")
-    unit: str
-    confidence: float | None = Field(description="in [0, 1], of the first instance or the least sure; null: none found")
-
-
-class Instance(BaseModel):
-    """label: given by the user; names: guesses, best first; score: in [0, 1], for a text how well it matches, else that
-    it is one thing; part, instances: what of it, or beside it, answers the text better."""
-
-    instance_id: int
-    label: str | None
-    names: list[str]
-    score: float
-    num_points: int
-    centroid: Vector
-    obb: dict[str, Any] = Field(description="center, rotation (its rows are the axes), extent (full side lengths)")
-    distance: float | None = Field(None, description="from the point to the nearest point")
-    part: int | None = None
-    instances: list[int] = []
-
-
-class InstancesAnswer(Answer):
-    hits: list[Instance]
-
-
-class DescribeAnswer(Answer, Instance):
-    aabb: dict[str, Vector]
-    colors: dict[str, float] = Field(description="shares by name")
-    texts: list[str] = Field(description="printed on it")
-    neighbors: list[dict[str, Any]] = Field(description="instance_id, label, gap between the nearest points")
-    relations: list[dict[str, str]] = Field(description="of the scene graph: thing, relation (on, in, …), other")
-    picture: Literal["photo", "render"] | None = Field(description="of what the picture is; null: there is none")
-    note: str | None = Field(None, description="why the picture is no photo")
-
-
-class MeasureAnswer(Answer):
-    distance: float = Field(description="between the nearest points")
-    center_distance: float
-    nearest_points: list[Vector] = Field(description="one of a, one of b")
-
-
-class PoseAnswer(Answer):
-    position: Vector = Field(description="on the floor")
-    yaw: float = Field(description="of x about z, radians")
-    pose: list[list[float]] = Field(description="[4, 4] frame_from_robot: origin on the floor, x to the instance, z up")
-    distance: float = Field(description="level, from the position to the nearest point")
-    seen: float = Field(description="share of the lines of sight that nothing blocks")
 
 
 class LocaliseAnswer(Answer, Place): ...
@@ -145,13 +100,38 @@ class Tool(Body):
 
 
 class Find(Tool):
-    """The instances that a text names, best first. Often there is none: then the thing is not in the map."""
+    """The instances that a text names, best first. Often there is none: then the thing is not in the map. Of a map of
+    several visits also what is gone, and when each was seen last."""
 
     text: Prompt = Field(description='a thing, such as "red mug" or "the book on the desk"')
     top_k: Top = 5
+    at: Visit | None = Field(None, description="as of this visit; else today")
 
     def fields_of(self, gmap: QueryMap, frame: Frame | None, photos: Path | None) -> dict[str, Any]:
-        return _listed(gmap, gmap.query(self.text, self.top_k, frame=frame))
+        gmap = gmap if self.at is None else gmap.at(self.at)
+        gone = gmap.gone(self.text, self.top_k, frame=frame)
+        return {**_listed(gmap, gmap.query(self.text, self.top_k, frame=frame)), **gmap.visits_json()} | {
+            "gone": _listed(gmap.last_known, gone)["hits"]
+        }
+
+
+class WhatChanged(Tool):
+    """What moved, came and went since an earlier visit of the scene, and what nobody looked at. In the map's frame."""
+
+    answer = ChangesAnswer
+    since: Visit | None = Field(None, description="a visit; else the one before the newest")
+
+    def fields_of(self, gmap: QueryMap, frame: Frame | None, photos: Path | None) -> dict[str, Any]:
+        if frame is not None:
+            raise UnknownFrame(f"frame: changes are in the map's own, '{gmap.frame}'; ask without frame")
+        facts, known = gmap.changes_json("last" if self.since is None else self.since), gmap.last_known
+        names = dict(zip((entry["id"] for entry in known.instances), _names(known), strict=True))
+        changes = [{**change, "names": names.get(change["instance_id"], [])} for change in facts["changes"]]
+        sure = [change["confidence"] for change in changes if change["confidence"] is not None]
+        return {key: facts[key] for key in ("since", "visits")} | {
+            "changes": changes,
+            "confidence": min(sure, default=None),
+        }
 
 
 class ListObjects(Tool):
@@ -251,13 +231,19 @@ class Localise(Tool, GivenPhoto):
 
 
 TOOLS: dict[str, type[Tool]] = {"localise": Localise, "find": Find, "list_objects": ListObjects, "describe": Describe}
+TOOLS |= {"what_changed": WhatChanged}
 TOOLS |= {"nearest": Nearest, "where_to_stand": WhereToStand, "measure": Measure}
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=2)  # of the map, and of the map with what is gone
 def _names(gmap: QueryMap) -> list[list[str]]:
     """The likely names of a map's instances in their order; empty lists when it cannot answer prompts."""
     return gmap.likely_names() if gmap.problem is None else [[] for _ in gmap.instances]
+
+
+def _known_names(gmap: QueryMap) -> None:
+    """`_names` of the map with what is gone."""
+    _names(gmap.last_known)
 
 
 @lru_cache(maxsize=1)
@@ -312,7 +298,7 @@ def make_server(engine: QueryEngine, photos: Path | None = None) -> Server[Any]:
 
     import perception.export.render  # noqa: F401  # torch, here and not within the time of the first answer
 
-    for learn in (_names, _relations):  # which may take longer than an answer
+    for learn in (_names, _known_names, _relations):  # which may take longer than an answer
         learn(engine.current)
         engine.on_reload(learn)
     if outside := photos_outside(engine.current, photos):

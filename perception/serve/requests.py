@@ -13,6 +13,7 @@ from pydantic import Field
 from perception.config import Settings
 from perception.errors import InputError
 from perception.query import Frame, Hit, QueryMap, Where
+from perception.query.hit import answer_json
 from perception.query.requests import TOP, UnknownInstance, check_prompt
 
 MAX_TEXTS = 32
@@ -113,7 +114,8 @@ def source(gmap: QueryMap, frame: Frame | None = None) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Request:
-    """One prompt with its filters; its coordinates and those of the reply are in `frame`, None = the map's.
+    """One prompt with its filters; its coordinates and those of the reply are in `frame`, None = the map's. at: the
+    visit as of which it is answered, None = today.
 
     InputError for an empty or overlong text, and for numbers out of range.
 
@@ -126,20 +128,25 @@ class Request:
     min_score: float | None = None
     where: Where | None = None
     frame: Frame | None = None
+    at: int | None = None
 
     def __post_init__(self) -> None:
         check_prompt(self.text, self.top_k, self.min_score)
 
     def answered(self, gmap: QueryMap, since: float) -> Reply:
         """The reply of one map; since: `time.monotonic()` when the request came."""
-        hits = gmap.query(self.text, self.top_k, self.min_score, where=self.where, frame=self.frame)
-        return Reply(self, tuple(hits), **source(gmap, self.frame), seconds=time.monotonic() - since)
+        gmap = gmap if self.at is None else gmap.at(self.at)
+        hits, gone = (
+            tuple(ask(self.text, self.top_k, self.min_score, where=self.where, frame=self.frame))
+            for ask in (gmap.query, gmap.gone)
+        )
+        return Reply(self, hits, **source(gmap, self.frame), seconds=time.monotonic() - since, gone=gone)
 
 
 @dataclass(frozen=True)
 class Reply:
-    """The answer to a request, computed on the map map_id alone. seconds: from submission to answer. A store's frame
-    and metric are None.
+    """The answer to a request, computed on the map map_id alone. seconds: from submission to answer. gone: of
+    `QueryMap.gone`. A store's frame and metric are None.
 
     >>> reply = Request("red mug").answered(perception.load_map("kitchen.gsmap"), time.monotonic())
     >>> reply.to_json()["present"], reply.frame, reply.metric
@@ -152,7 +159,8 @@ class Reply:
     frame: str
     metric: bool
     seconds: float
+    gone: tuple[Hit, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """An entry of `results` in the JSON output."""
-        return {"text": self.request.text, "present": bool(self.hits), "hits": [hit.to_json() for hit in self.hits]}
+        return answer_json(self.request.text, self.hits, self.gone)

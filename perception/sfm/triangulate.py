@@ -19,7 +19,7 @@ from perception.sfm.model import cloud_of
 from perception.sfm.options import Cloud, ReadOptions
 from perception.sfm.pose_refinement import checked_poses
 from perception.sfm.tracks import features_of, tracks_of
-from perception.types import Scene, View
+from perception.types import Lens, Scene, View
 
 MIN_POINTS = 50
 FALLBACK_POINTS = 5000
@@ -31,7 +31,8 @@ def posed_scene(views: list[View], cloud: Cloud, facts: dict[str, Any], options:
     cameras = sorted({lens_text(view_lens(view)) for view in views})
     report = {**facts, "registered": len(views), "cameras": cameras, "seconds": {}}
     photos, sizes, own = map(list, zip(*((view.photo, view.photo_size, view.mask) for view in views), strict=True))
-    still = with_still(photos, sizes, own, options.still_folder(own), options.progress)
+    as_stored = [view.as_stored for view in views]
+    still = with_still(photos, sizes, own, options.still_folder(own), options.progress, as_stored)
     views = [replace(view, mask=mask) for view, mask in zip(views, still.masks, strict=True)]
     report |= still.added_to(report)
     points, colors = cloud
@@ -39,7 +40,7 @@ def posed_scene(views: list[View], cloud: Cloud, facts: dict[str, Any], options:
     doubted = options.poses == "auto" and (few or any(view.depth is not None for view in views))
     check = doubted or options.poses == "refine"
     if few or check:
-        as_stored, lenses = [view.as_stored for view in views], list(map(view_lens, views))
+        lenses: list[Lens | None] = [view_lens(view) for view in views]
         store = build_features(photos, lenses, options, still.masks, posed=True, as_stored=as_stored)
         report["seconds"] = store.facts["seconds"]
         features = features_of(views, store)

@@ -17,16 +17,19 @@ import numpy as np
 
 from perception.colors import instance_palette
 from perception.errors import InputError, missing_extra
+from perception.map.history import is_removed
 from perception.serve.listening import Guard, check_address, listen, url_host
 from perception.viewer.handshake import guarded_server
 from perception.viewer.levels import MOST, Level, level
 from perception.viewer.panel import Panel
 from perception.viewer.picking import covariances
-from perception.viewer.session import HIGHLIGHT, Session
+from perception.viewer.session import HIGHLIGHT, STATE_COLORS, Session
 
 _log = logging.getLogger("perception.viewer")
 WATCH = 1.0
 """Seconds between checks whether another program changed the map."""
+GHOST_SIZE = 0.02
+"""Side of a point of what stood elsewhere, where the map has size 10."""
 CORNERS = np.array([[i >> a & 1 for a in range(3)] for i in range(8)]) - 0.5  # of a unit box
 EDGES = np.array([(i, i | 1 << a) for i in range(8) for a in range(3) if not i >> a & 1])
 
@@ -135,8 +138,13 @@ class Viewer:
             handle.remove()
         self._overlays, scene, session = [], self.server.scene, self.session
         lit = session.lit()
+        if len(ghosts := session.ghosts()):
+            points, size = (ghosts * self.scale).astype(np.float32), GHOST_SIZE
+            red = STATE_COLORS["removed"]
+            self._overlays.append(scene.add_point_cloud("/map/ghosts", points, red, point_size=size))
         for entry in session.editor.instances if self._boxed else ():
-            if not entry.get("hidden") and (not lit or entry["id"] in lit):
+            gone = is_removed(entry) and session.mode != "changes"
+            if not entry.get("hidden") and not gone and (not lit or entry["id"] in lit):
                 box, number = entry["obb"], entry["id"]
                 points = np.array(box["center"]) + (CORNERS * box["extent"]) @ np.array(box["rotation"])
                 segments = (points[EDGES] * self.scale).astype(np.float32)

@@ -6,6 +6,7 @@ import string
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from perception.map.history import date_of, is_removed, last_seen, since, visits_of
 from perception.query.hit import printed_texts
 from perception.report.text import frame_lines
 from perception.viewer.session import MODES, Session
@@ -67,7 +68,8 @@ class Panel:
 
     def _build_show(self) -> None:
         with self.gui.add_folder("Show"):
-            mode = self.gui.add_dropdown("colours", MODES, initial_value=self.session.mode)
+            modes = MODES if self.session.editor.original.newest_visit else MODES[:-1]
+            mode = self.gui.add_dropdown("colours", modes, initial_value=self.session.mode)
             boxes = self.gui.add_checkbox("boxes and names", False)
             clear = self.gui.add_button("Clear selection")
 
@@ -142,8 +144,9 @@ class Panel:
         """Updates all texts of the panel from the session's state."""
         session, editor = self.session, self.session.editor
         unit = "m" if editor.original.metric else "map units"
+        count = sum(not is_removed(entry) for entry in editor.instances)
         shown = f" (shown: {self.viewer.detail})" if self.viewer.detail else ""
-        self._facts.content = f"**{len(editor.ids):,} Gaussians{shown} · instances: {len(editor.instances)}**"
+        self._facts.content = f"**{len(editor.ids):,} Gaussians{shown} · instances: {count}**"
         self._refresh_answer()
         photo = None
         if not session.selected:
@@ -158,6 +161,7 @@ class Panel:
                 f"**{escaped(session.name(entry))}** (id {entry['id']})  \nconfidence {entry['score']:.2f} · "
                 f"{entry['num_gaussians']} Gaussians  \nbox {sides} {unit}"
                 + (f"  \n{len(entry['parts'])} parts; Split takes it apart" if entry.get("parts") else "")
+                + (f"  \n{self._history_of(entry)}" if entry.get("state") else "")
                 + (f"  \nprinted: {escaped(', '.join(printed_texts(entry)[:5]))}" if entry.get("texts") else "")
             )
             named = (entry["id"], entry.get("label"))
@@ -174,6 +178,13 @@ class Panel:
         unsaved = "unsaved changes" if editor.dirty else "all saved"
         self._history.content = f"*{unsaved}*" + "".join(f"  \n{escaped(what)}" for what in reversed(last))
 
+    def _history_of(self, entry: dict[str, Any]) -> str:
+        """What the visits tell of an instance."""
+        gmap = self.session.editor.original
+        visits, newest = visits_of(gmap.info, len(gmap.views)), gmap.newest_visit
+        found, seen = date_of(visits, since(entry)), date_of(visits, last_seen(entry, newest))
+        return f"{entry['state']}; {'gone' if is_removed(entry) else 'here'} since {found}, last seen {seen}"
+
     def _refresh_answer(self) -> None:
         session = self.session
         for button in self._hit_buttons:
@@ -183,10 +194,10 @@ class Panel:
         if not session.question:
             self._answer.content = ""
             return
-        if not session.hits:
-            self._answer.content = f'"{escaped(session.question)}": **not present**'
-            return
-        self._answer.content = f'"{escaped(session.question)}": {len(session.hits)} found'
+        answer = f"{len(session.hits)} found" if session.hits else "**not present**"
+        entries = [session.editor.entry(hit.instance_id) for hit in session.gone]
+        gone = [f"  \n{escaped(session.name(entry))}: {self._history_of(entry)}" for entry in entries]
+        self._answer.content = f'"{escaped(session.question)}": {answer}' + "".join(gone)
         with self._hits_folder:
             for rank, hit in enumerate(session.hits, start=1):
                 name = session.name(session.editor.entry(hit.instance_id))

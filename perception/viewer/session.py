@@ -17,7 +17,10 @@ from perception.query import Hit, QueryMap
 from perception.query.crops import OUTSIDE, PhotoOutside, best_crop
 from perception.viewer.picking import pick, pick_point
 
-MODES = ("photo", "instances", "parts", "features")
+MODES = ("photo", "instances", "parts", "features", "changes")
+"""Colours of the Gaussians; the last only in maps of several visits."""
+STATE_COLORS = {"moved": (50, 110, 255), "added": (40, 200, 80), "removed": (235, 60, 50), "unseen": (70, 70, 80)}
+"""Of things by the newest visit; what is unchanged has the colours of the photos."""
 HIGHLIGHT = np.array([255, 214, 10], np.uint8)
 
 
@@ -56,6 +59,7 @@ class Session:
         self.part: int | None = None
         self.question = ""
         self.hits: list[Hit] = []
+        self.gone: list[Hit] = []
         self.measuring, self.ends, self.notes = False, list[np.ndarray](), list[str]()
         self._opened: tuple[int, QueryMap] | None = None
         self._edits = 0
@@ -69,6 +73,7 @@ class Session:
         """Ranked hits, which are then highlighted; empty when the text is not present. None is hidden."""
         hidden = {entry["id"] for entry in self.editor.instances if entry.get("hidden")}
         hits = self._loaded().query(text, top_k + len(hidden))
+        self.gone = self._loaded().gone(text, top_k)
         self.question = " ".join(text.split())
         self.hits = [hit for hit in hits if hit.instance_id not in hidden][:top_k]
         self.select(None)
@@ -95,7 +100,7 @@ class Session:
 
     def clear(self) -> None:
         """Clears the question, its hits and the selection."""
-        self.hits, self.question = [], ""
+        self.hits, self.gone, self.question = [], [], ""
         self.select(None)
 
     def pick(self, origin: np.ndarray, direction: np.ndarray, add: bool = False) -> int | None:
@@ -149,6 +154,7 @@ class Session:
         parts = {part["id"] for entry in self.editor.instances for part in entry.get("parts", [])}
         self.selected = [instance for instance in self.selected if instance in known]
         self.part = self.part if self.part in parts else None
+        self.gone = [hit for hit in self.gone if hit.instance_id in known]
         self.hits = [hit for hit in self.hits if hit.instance_id in known and hit.part in {None, *parts}]
 
     def reopen(self) -> None:
@@ -167,9 +173,19 @@ class Session:
         ids, parts = self.editor.ids, self.editor.part_ids
         shown = self.finest_ids() if self.mode == "parts" else ids
         colors = paint(self.editor.original, shown, self.mode)
+        for entry in self.editor.instances if self.mode == "changes" else ():
+            if (color := STATE_COLORS.get(entry.get("state", ""))) is not None:
+                colors[ids == entry["id"]] = color
         if self.part is not None:
             return highlight(colors, parts, [self.part])
         return highlight(colors, ids, self.lit())
+
+    def ghosts(self) -> np.ndarray:
+        """[M, 3] float32 points of what the newest visit found moved or gone, where it stood before; in the mode
+        "changes" only."""
+        past, newest = self.editor.current().past, self.editor.original.newest_visit
+        rows = past["until"] == newest - 1 if past and self.mode == "changes" else []
+        return past["means"][rows] if len(rows) else np.zeros((0, 3), np.float32)
 
     def finest_ids(self) -> np.ndarray:
         """[N] the part of each Gaussian, else its instance, −1 = none: what is never shown in one colour."""

@@ -119,13 +119,15 @@ def test_parts_belong_to_their_whole_and_lists_are_whole(path: Path) -> None:
 
 
 ARCHIVES: list[tuple[str, str, Any]] = [
-    ("language", "view_counts", [2, 2, 3]), ("language", "view_counts", [-1, 3, 4]),
-    ("language", "view_counts", [2.0, 2, 2]), ("language", "embeddings", np.zeros((2, 3), np.float32)),
-    ("language", "embeddings", np.full((3, 3), np.nan, np.float32)), ("language", "view_boxes", [[0] * 4] * 5),
+    ("language", "view_counts", [2, 2, 3, 1]), ("language", "view_counts", [-1, 3, 4, 1]),
+    ("language", "view_counts", [2.0, 2, 2, 1]), ("language", "embeddings", np.zeros((2, 3), np.float32)),
+    ("language", "embeddings", np.full((4, 3), np.nan, np.float32)), ("language", "view_boxes", [[0] * 4] * 5),
     ("language", "palettes", np.zeros((3, 24), np.float32)), ("language", "encoder", 3),
     ("parts", "ids", np.zeros(180, np.int32)), ("parts", "ids", np.full(20, -1)),
-    ("parts", "language_embeddings", np.zeros((3, 3), np.float32)), ("groups", "of", [0, 2, -1]),
-    ("groups", "of", [0, 0, -1, 0]), ("groups", "scores", np.zeros((1, 1))), ("groups", "language_view_counts", [7]),
+    ("parts", "language_embeddings", np.zeros((3, 3), np.float32)), ("groups", "of", [0, 2, -1, -1]),
+    ("groups", "of", [0, 0, -1, 0, -1]), ("groups", "scores", np.zeros((1, 1))),
+    ("groups", "language_view_counts", [7]), ("past", "ids", [2, 40, 0]), ("past", "until", [0, 7, 0]),
+    ("past", "means", np.full((3, 3), np.nan, np.float32)),
 ]  # fmt: skip
 
 

@@ -37,6 +37,13 @@ def _full(side: int = 64) -> dict[str, Any]:
         "seconds": {NASTY: 3.0, "masks": 70.0},
         "views": [{f"photo {NASTY}": picture(), f"render {NASTY}": picture(), "error": picture()} for _ in range(3)],
         "overview": {NASTY: picture()},
+        "changes": {
+            "title": NASTY,
+            "rows": [
+                {"id": 3, "pictures": (picture(), None), "cells": ["moved", NASTY, "", "confidence 0.9", NASTY, NASTY]}
+            ],
+            "rest": [NASTY],
+        },
         "instances": [_instance(i, picture(), None, [NASTY]) for i in range(40)],
         "metric": True,
         "queries": [
@@ -58,7 +65,7 @@ def test_the_page_is_well_formed_and_fetches_nothing(tmp_path: Path) -> None:
     path = write_page(tmp_path / "report.html", _full())
     tree = _tree(path)
     sources = [e.get(key) for e in tree.iter() for key in ("src", "href", "srcset", "action") if e.get(key)]
-    assert len(sources) == 3 * 3 + 1 + 40 + 1
+    assert len(sources) == 3 * 3 + 1 + 40 + 1 + 1
     assert all(source.startswith("data:image/webp;base64,") for source in sources if source)
     text = path.read_text(encoding="utf-8")
     assert not re.search(r"https?://|@import|url\(", text)

@@ -29,7 +29,7 @@ def hit_of(instance_id: int, x: float, label: str | None = None) -> Hit:
 
 def test_answers_stand_in_columns_with_their_names_and_units() -> None:
     hits = [hit_of(3, 1.0, "grandma's cup"), hit_of(12, -10.5), hit_of(7, 0.0)]
-    lines = query_text([("mug", hits), ("dragon", [])], True, {12: "coffee mug"}).splitlines()
+    lines = query_text([("mug", hits, []), ("dragon", [], [])], True, {12: "coffee mug"}).splitlines()
     assert lines[0] == '"mug": 3 found' and lines[-1] == '"dragon": not present'
     rows = lines[1:4]
     assert [row.split()[1] for row in rows] == ["grandma's", "coffee", "no"]
@@ -37,7 +37,7 @@ def test_answers_stand_in_columns_with_their_names_and_units() -> None:
     for column in ("score", "at ", "size ", "instance "):
         assert len({row.index(column) for row in rows}) == 1
     assert all("size 10 x 25 x 150 cm" in row for row in rows) and "at -10.50 0.00 0.00 m" in rows[1]
-    assert "cm" not in query_text([("mug", hits)], False)  # without a scale no unit is claimed
+    assert "cm" not in query_text([("mug", hits, [])], False)  # without a scale no unit is claimed
 
 
 def test_the_first_three_lines_of_info_are_what_how_good_and_what_next() -> None:

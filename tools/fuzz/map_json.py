@@ -64,7 +64,7 @@ def as_text(value: Any) -> str:
 
 def write_full_map(path: Path, photos: Path) -> None:
     """The newest released map, with every section that map.json may have, texts and groups."""
-    from perception.language.description import InstanceDescription, to_arrays
+    from perception.language.description import InstanceDescription, from_arrays, to_arrays
     from perception.map.map import prefixed
     from perception.map.write import read_map, write_map
     from perception.photos.view_json import stored_view
@@ -86,6 +86,18 @@ def write_full_map(path: Path, photos: Path) -> None:
         "gravity": {"direction": [0.0, 1.0, 0.0], "standard_error_deg": 1.0, "source": "walls"},
         "quality": {**gmap.info["quality"], "depth": depth},
     }  # fmt: skip
+    spot = {key: gmap.instances[2][key] for key in ("centroid", "obb")}
+    gone = {"state": "removed", "confidence": 0.9, "first_seen": 0, "last_seen": 0, "last_looked_for": 2}
+    gone["past"] = [{"until": 0, "transform": np.eye(4).tolist(), **spot}, {"until": 1, "transform": None, **spot}]
+    for entry in gmap.instances[:2]:
+        entry |= {"state": "unchanged", "confidence": 1.0, "first_seen": 1, "last_seen": 2, "past": [gone["past"][0]]}
+    gmap.instances.append({**gmap.instances[2], **gone, "id": 40, "num_gaussians": 0})
+    gmap.language = to_arrays([*from_arrays(gmap.language)[0], described], "color-test")
+    gmap.groups["of"] = np.append(gmap.groups["of"], np.int32(-1))
+    means, ids = np.zeros((3, 3), np.float32), np.array([40, 40, gmap.instances[0]["id"]], np.int32)
+    gmap.past = {"means": means, "ids": ids, "until": np.array([0, 1, 0], np.int32)}
+    visit = {"time": "2026-11-25T19:41:58Z", "input": "photos", "photos": 3}
+    gmap.info["visits"] = [visit, {**visit, "time": None}, visit]
     write_map(path, gmap)
 
 
@@ -118,7 +130,7 @@ def _command(*words: str) -> Callable[[Path], None]:
         assert code == 0, (code, failed.getvalue())
         json.loads(told.getvalue(), parse_constant=_no_number)
         with contextlib.redirect_stdout(io.TextIOWrapper(io.BytesIO(), "utf-8")), contextlib.redirect_stderr(failed):
-            if words[0] in ("info", "query"):
+            if words[0] in ("info", "query", "changes"):
                 main(line)
 
     run.__name__ = " ".join(words)
@@ -144,7 +156,12 @@ def _served(folder: Path) -> None:
         json.dumps(engine.health(), allow_nan=False)
         ids = [int(entry["id"]) for entry in gmap.instances]
         asked: list[tuple[str, dict[str, Any]]] = [("find", {"text": text}) for text in _PROMPTS]
-        asked += [("list_objects", {}), ("nearest", {"point": [0, 0, 0], "top_k": 3})]
+        asked += [
+            ("what_changed", {}),
+            ("find", {"text": "lime", "at": 0}),
+            ("list_objects", {}),
+            ("nearest", {"point": [0, 0, 0], "top_k": 3}),
+        ]
         for i in ids[:4]:
             asked += [("describe", {"id": i}), ("measure", {"a": ids[0], "b": i}), ("where_to_stand", {"id": i})]
             encode(gmap, i, "npz"), encode(gmap, i, "ply")
@@ -173,7 +190,8 @@ def _viewed(folder: Path) -> None:
     for text in _PROMPTS:
         with contextlib.suppress(InputError):
             session.ask(text)
-    session.colors(), session.opacities(), session.pick(np.zeros(3), np.array([0.0, 0, 1]))
+    session.mode = "changes"
+    session.ghosts(), session.colors(), session.opacities(), session.pick(np.zeros(3), np.array([0.0, 0, 1]))
     ids = [entry["id"] for entry in editor.instances]
     steps: list[Callable[[], object]] = [partial(session.crop, i) for i in ids[:3]]
     steps += [partial(editor.split, i) for i in ids[1:2]] + [partial(editor.merge, ids[:1] + ids[2:3])]
@@ -189,6 +207,7 @@ def _viewed(folder: Path) -> None:
 COMMANDS: tuple[Callable[[Path], None], ...] = (
     _command("info", "m"), _command("info", "m", "--verify"), _command("query", "m", *_PROMPTS),
     _command("query", "m", "lime", "--min-score", "0", "--points", "new/p.ply"), _command("query", "s", *_PROMPTS),
+    _command("query", "m", *_PROMPTS, "--at", "0"), _command("changes", "m"), _command("changes", "m", "--since", "0"),
     _command("query", "s", "lime", "--min-score", "0"), _command("index", "m", "-o", "new/new.store"),
     _command("index", "m", "-o", "s"), _command("export", "m", "-o", "new/a.ply"),
     _command("export", "m", "--points", "c", "-o", "new/a.npz"), _command("export", "m", "-o", "new/a.spz"),

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from perception.config import Settings, settings_from
 from perception.errors import InputError
 from perception.io.documents import read_yaml
-from perception.map.map import Map
 from perception.query import Frame, QueryMap
 
 
@@ -33,11 +32,11 @@ class FrameFile(Settings):
             raise InputError(
                 f"{gmap.path}: its unit is unknown; frame file: expected scale, metres per unit of the map"
             )
-        held: Map = gmap
+        held = gmap.record
         if self.scale not in (None, 1.0):
             from perception.edit.scale import scaled
 
-            held = scaled(gmap, self.scale)
+            held = scaled(held, self.scale)
         info = {**held.info, "frame": child, "metric": True}
         made = QueryMap.of(held, info=info, encoders=gmap.encoders)
         made.warm()

@@ -42,12 +42,15 @@ def instance(hit: Hit) -> Message:
         "pose": pose(hit.obb),
         "size": xyz(hit.obb.extent),
         "covariance": np.asarray(hit.covariance, np.float64).reshape(-1),
+        "state": hit.state or "",
+        "last_seen": -1 if hit.last_seen is None else hit.last_seen,
     }
 
 
-def instance_array(hits: Iterable[Hit], map_id: str, frame: str, stamp: Stamp) -> Message:
+def instance_array(hits: Iterable[Hit], map_id: str, frame: str, stamp: Stamp, gone: Iterable[Hit] = ()) -> Message:
     """perception_msgs/InstanceArray."""
-    return {"header": header(frame, stamp), "map_id": map_id, "instances": [instance(hit) for hit in hits]}
+    instances = {"instances": [instance(hit) for hit in hits], "gone": [instance(hit) for hit in gone]}
+    return {"header": header(frame, stamp), "map_id": map_id, **instances}
 
 
 def map_info(gmap: QueryMap, path: Path, stamp: Stamp) -> Message:
@@ -62,6 +65,7 @@ def map_info(gmap: QueryMap, path: Path, stamp: Stamp) -> Message:
         "gravity": xyz([0.0, 0.0, 0.0] if down is None else down),
         "num_instances": len(gmap.instances),
         "num_gaussians": len(gmap),
+        "visits": [visit.time or "" for visit in gmap.visits],
     }
 
 

@@ -228,6 +228,7 @@ class MapNode(LifecycleNode):
     def _clear(self, frame: str) -> None:
         head, send = answers.header(frame, _now()), self._transport.publish
         send(answers.MAP_CLOUD, {"header": head})
+        send(answers.CHANGES, {})
         send(messages.MARKERS, answers.box_markers([], "map", head))
         send(messages.WORLD, {})
         for topic in (messages.INFO, messages.INSTANCES, messages.GRID):
@@ -237,7 +238,8 @@ class MapNode(LifecycleNode):
         """The service of perception_msgs/Query."""
 
         def answered(reply: Reply) -> dict[str, Any]:
-            return {"answer": messages.instance_array(reply.hits, reply.map_id, reply.frame, _now())}
+            found = messages.instance_array(reply.hits, reply.map_id, reply.frame, _now(), reply.gone)
+            return {"answer": found}
 
         return self._answer(response, lambda: self._gate.submit(self._request(request)), answered)
 
