@@ -59,15 +59,8 @@ def poses_mark(source: Path, config: MapConfig) -> str:
     """Hash of the input path and the settings that change the poses and the sparse cloud."""
     photos = config.photos
     files = (photos.camera, photos.ignore_masks, photos.init_points)
-    return digest(
-        os.path.realpath(source),
-        *files,
-        photos.strict,
-        photos.poses,
-        photos.ignore_still,
-        config.frame.model_dump(),
-        config.seed,
-    )
+    ways = (photos.strict, photos.poses, photos.ignore_still, config.frame.model_dump(), config.seed)
+    return digest(os.path.realpath(source), *files, *ways)
 
 
 def training_mark(source: Path, config: MapConfig) -> str:
