@@ -58,9 +58,9 @@ def fingerprint(source: Path, config: MapConfig) -> str:
 def poses_mark(source: Path, config: MapConfig) -> str:
     """Hash of the input path and the settings that change the poses and the sparse cloud."""
     photos = config.photos
-    files = (photos.camera, photos.ignore_masks, photos.init_points)
-    ways = (photos.strict, photos.poses, photos.ignore_still, config.frame.model_dump(), config.seed)
-    return digest(os.path.realpath(source), *files, *ways)
+    masks = (photos.ignore_masks, photos.ignore_still)
+    chosen = (photos.camera, photos.strict, photos.poses, *masks, photos.init_points)
+    return digest(os.path.realpath(source), *chosen, config.frame.model_dump(), config.seed)
 
 
 def training_mark(source: Path, config: MapConfig) -> str:

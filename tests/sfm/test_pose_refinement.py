@@ -228,3 +228,26 @@ def test_few_matches_are_no_check(made):
     _, right, features = made
     given, views, report = check(replace(features, pairs=features.pairs[:20]), right)
     assert views is given and "not checked: 20" in report["notes"][0]
+
+
+def test_things_that_move_with_the_camera_do_not_drag_good_poses(made):
+    """In two corners of every photo stand the same features, and outnumber those of the scene."""
+    rng, right, features = made
+    count = 200
+    corners = rng.uniform((0.30, -0.35), (0.42, -0.20), (count, 2)) * np.where(rng.random((count, 1)) < 0.5, (1, 1), -1)
+    pairs = []
+    for a in range(VIEWS):
+        for b in range(a + 1, min(a + 6, VIEWS)):
+            of = rng.choice(count, 150, replace=False)
+            pairs.append(len(features.view) + np.stack([a * count + of, b * count + of], axis=1))
+    noisy = np.tile(corners, (VIEWS, 1)) + rng.normal(0, NOISE / FOCAL, (VIEWS * count, 2))
+    held = Features(
+        np.concatenate([features.view, np.repeat(np.arange(VIEWS), count)]),
+        np.concatenate([features.rays, noisy]),
+        np.full(len(features.view) + len(noisy), FOCAL),
+        np.concatenate([features.depth, np.full(len(noisy), 0.3)]),
+        np.concatenate([features.pairs, *pairs]),
+    )
+    given, views, report = check(held, right)
+    np.testing.assert_array_equal(poses_of(views).center, poses_of(given).center)
+    assert not report["poses"]["refined"] and report["warnings"]
