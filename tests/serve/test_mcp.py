@@ -348,7 +348,7 @@ def test_clients_that_vanish_leave_the_server_answering(port: int) -> None:
 
 
 def test_the_rules_for_host_token_and_size_are_those_of_serve(port: int, tmp_path: Path) -> None:
-    with httpx2.Client() as web:
+    with httpx2.Client(timeout=60) as web:
         send = {"content": b"{}", "headers": {"Content-Type": "application/json"}}
         refused = web.post(at(port), content=b"{}", headers={**send["headers"], "Host": "evil.example"})
         assert refused.status_code == 403 and "not this machine" in refused.json()["error"]
