@@ -357,7 +357,7 @@ def test_the_rules_for_host_token_and_size_are_those_of_serve(port: int, tmp_pat
         assert large.status_code == 413 and "8388608" in large.json()["error"]
     path = write_map_of(tmp_path / "a.gsmap", gaussians=300)
     with server(["-c", HTTP, str(path), TOKEN], tmp_path) as (_, own):
-        with httpx2.Client() as web:
+        with httpx2.Client(timeout=60) as web:
             assert web.post(at(own), **send).status_code == 401
 
         async def session(client: Client) -> None:
