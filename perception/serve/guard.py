@@ -67,7 +67,7 @@ OPEN = {"/openapi.json", "/health"}
 """Paths that need no token; without one, /health returns its status only."""
 LARGER = {"/localise": MAX_PICTURE, "/mcp": MAX_PICTURE}
 """Paths whose requests hold pictures, and their largest."""
-_MAX_DROPPED = MAX_PICTURE
+_MAX_DROPPED = 2 * MAX_PICTURE
 _HEADERS = [
     (b"x-content-type-options", b"nosniff"),
     (b"cache-control", b"no-store"),

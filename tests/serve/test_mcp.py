@@ -348,7 +348,7 @@ def test_clients_that_vanish_leave_the_server_answering(port: int) -> None:
 
 
 def test_the_rules_for_host_token_and_size_are_those_of_serve(port: int, tmp_path: Path) -> None:
-    with httpx2.Client() as web:
+    with httpx2.Client(timeout=60) as web:
         send = {"content": b"{}", "headers": {"Content-Type": "application/json"}}
         refused = web.post(at(port), content=b"{}", headers={**send["headers"], "Host": "evil.example"})
         assert refused.status_code == 403 and "not this machine" in refused.json()["error"]
@@ -357,7 +357,7 @@ def test_the_rules_for_host_token_and_size_are_those_of_serve(port: int, tmp_pat
         assert large.status_code == 413 and "8388608" in large.json()["error"]
     path = write_map_of(tmp_path / "a.gsmap", gaussians=300)
     with server(["-c", HTTP, str(path), TOKEN], tmp_path) as (_, own):
-        with httpx2.Client() as web:
+        with httpx2.Client(timeout=60) as web:
             assert web.post(at(own), **send).status_code == 401
 
         async def session(client: Client) -> None:
