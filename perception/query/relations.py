@@ -19,9 +19,9 @@ import numpy as np
 
 from perception.frame.gravity import up_from_cameras
 from perception.language.printed import found_after_a_word, quoted_text
+from perception.language.shapes import level_frame, ramp
 from perception.map.map import Map
 from perception.query.ranking import PRESENT, Answer, Scorer
-from perception.query.shapes import level_frame, ramp
 
 TRIM = 0.02  # share of an instance's points left out of its box at either end of each axis
 WEIGHT = 3.0  # added to z for a full match, in standard deviations of the map's probes

@@ -92,7 +92,7 @@ class TextRanking:
 
     def _shapes(self) -> np.ndarray:
         from perception.frame.gravity import Gravity
-        from perception.query.shapes import shape_scores
+        from perception.language.shapes import shape_scores
 
         index = self._gmap.index
         owners = np.repeat(index.ids, np.diff(index.starts))
@@ -120,7 +120,7 @@ def extents(gmap: Map) -> np.ndarray:
     """[I, 3] sides of the instances along the axes of their boxes, or thinner: along the normal of their best plane;
     without the outer TRIM of the points at either end, which stray in a map, and scaled as if spread evenly.
     """
-    from perception.query.shapes import plane_normal
+    from perception.language.shapes import plane_normal
 
     sides = np.zeros((len(gmap.instances), 3))
     for n, entry in enumerate(gmap.instances):

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from perception.language.shape_words import KINDS, head_noun, shape_kind
-from perception.query.shapes import boxiness, covered_area, roundness, shape_scores, up_from_cameras
+from perception.language.shapes import boxiness, covered_area, roundness, shape_scores, up_from_cameras
 from support.aimed import look_at
 
 
