@@ -45,7 +45,7 @@ def with_stereo(
         make_stereo_view(view, photo.photo.numpy(), _prior(view, points[mine]), photo.keep) if mine.any() else None
         for view, photo, mine in zip(views, decoded, seen, strict=True)
     ]
-    measure_depths([stereo for stereo in made if stereo is not None], progress)
+    measure_depths([stereo for stereo in made if stereo is not None], progress, "stereo")
     found = []
     for photo, stereo in zip(decoded, made, strict=True):
         if stereo is not None:

@@ -124,6 +124,9 @@ def optimise(
     if config != run.config:
         size = f"{config.train.iterations} iterations, at most {config.train.budget} Gaussians"
         trainer.record.decisions.append(f"size: {size}, for {len(photos.views)} photos")
+    depths = [view.depth for view in photos.views if view.depth is not None and not view.measured]
+    if found := [float((depth > 0).double().mean()) for depth in depths]:
+        trainer.record.decisions.append(f"stereo: depth in {np.mean(found):.0%} of the pixels of {len(found)} photos")
     masks_enter = GEOMETRY_START if source.needs_depth else config.losses.start
     observer = TrainingObserver(run.work, run.mark, source.identity, masks_enter, run.progress)
     observer.take_up(trainer)
