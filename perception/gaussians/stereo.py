@@ -15,7 +15,7 @@ import torch
 
 from perception.gaussians.views import TrainingView
 from perception.masks.cues import filled_depth
-from perception.masks.stereo import make_stereo_view, measure_depths
+from perception.masks.stereo import SIDE, make_stereo_view, measure_depths
 from perception.photos.depth import without_edges
 from perception.progress import QUIET, Progress
 from perception.types import View
@@ -34,8 +34,10 @@ def with_stereo(
     views: Sequence[View], decoded: list[TrainingView], points: np.ndarray, progress: Progress = QUIET
 ) -> list[TrainingView]:
     """The `decoded` photos of `views` with the depth [H, W] that stereo finds, marked as not measured; as given when
-    any has measured depth, or where the median one of the sparse points [P, 3] is visible in more than FEW photos."""
-    if len(points) < LEAST_POINTS or len(views) < 2 or any(view.depth is not None for view in views):
+    any has measured depth or fewer than SIDE pixels on its long side, or where the median one of the sparse points
+    [P, 3] is visible in more than FEW photos."""
+    small = any(max(photo.photo.shape) < SIDE for photo in decoded)
+    if len(points) < LEAST_POINTS or len(views) < 2 or small or any(view.depth is not None for view in views):
         return decoded
     seen = [visible_points(view, points) for view in views]
     count = np.sum(seen, axis=0)

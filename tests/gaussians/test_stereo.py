@@ -20,7 +20,7 @@ from perception.pipeline.record import depth_used
 from perception.types import DepthImage, View
 from support.aimed import look_at
 
-WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
+WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
 SLOPE, NEAR, HALF = 0.2, 2.6, 0.5
 """The large wall is y = 4 + SLOPE x, the small one y = NEAR with |x|, |z| ≤ HALF."""
@@ -67,10 +67,10 @@ def shots() -> list[tuple[View, TrainingView, np.ndarray]]:
 def test_depths_are_right_where_photos_agree(shots):
     views, decoded, depths = (list(part) for part in zip(*shots, strict=True))
     weight = torch.ones(HEIGHT, WIDTH)
-    weight[:20] = 0
+    weight[:40] = 0
     decoded[0] = replace(decoded[0], weight=weight)
     found = with_stereo(views, decoded, sparse(300))
-    assert not found[0].depth[:20].any()  # ignored pixels
+    assert not found[0].depth[:40].any()  # ignored pixels
     for view, depth in zip(found, depths, strict=True):
         known = view.depth.numpy() > 0
         error = np.abs(view.depth.numpy() / depth - 1)[known]
@@ -90,6 +90,8 @@ def test_stereo_is_left_out_where_it_is_not_needed(shots):
     assert with_stereo(views, decoded, sparse(LEAST_POINTS - 1)) is decoded
     measured = [replace(views[0], depth=DepthImage(Path("depth.png"), 0.001)), *views[1:]]
     assert with_stereo(measured, decoded, sparse(300)) is decoded
+    halves = [view.halved() for view in decoded]  # too small to be matched
+    assert with_stereo(views, halves, sparse(300)) is halves
     many = FEW // len(views) + 1  # so that each point is in more than FEW photos
     assert with_stereo(many * views, many * decoded, sparse(300)) == many * decoded
 

@@ -1,4 +1,4 @@
-"""Thins a posed scene, maps the photos that are left, and scores renders of the others: PSNR, the worst view, veils.
+"""Thins a posed scene, maps the photos left, and scores the others: PSNR, worst view, veils.
 
 python tools score.veils INPUT [--every N] [--set KEY=VALUE] [--seeds 0,1] [--name NAME] [-o OUTPUT]
 
