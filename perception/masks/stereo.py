@@ -88,7 +88,7 @@ def make_stereo_view(view: View, photo: np.ndarray, depth: np.ndarray, keep: Kee
     return StereoView(view.name, keep(small), keep(grey), K, pose, keep(prior), filled, known, measured, keep=keep)
 
 
-def measure_depths(views: list[StereoView], progress: Progress = QUIET) -> None:
+def measure_depths(views: list[StereoView], progress: Progress = QUIET, stage: str = "masks (stereo)") -> None:
     """Replaces the depths of all views by stereo depths, and marks the pixels confirmed by other views.
     Depths that a sensor measured are kept, averaged with those of the views that agree."""
     chosen = choose_neighbours(views)
@@ -96,7 +96,7 @@ def measure_depths(views: list[StereoView], progress: Progress = QUIET) -> None:
     for i, (view, near) in enumerate(zip(views, chosen, strict=True), start=1):
         swept = near and not view.measured
         depths.append(view.keep(sweep(view, [views[j] for j in near])) if swept else view.depth)
-        progress.update("masks (stereo)", i, len(views))
+        progress.update(stage, i, len(views))
     for view, depth, near in zip(views, depths, chosen, strict=True):
         if near:
             agreeing, mean = confirmed(depth, view, [views[j] for j in near], [depths[j] for j in near])

@@ -21,6 +21,7 @@ from perception.errors import InputError
 from perception.gaussians.device import choose_device
 from perception.gaussians.model import Gaussians, Nearby
 from perception.gaussians.state import TrainRecord, sized
+from perception.gaussians.stereo import visible_points
 from perception.gaussians.views import surface_depth
 from perception.geometry import camera_centres
 from perception.machine import memory_limit
@@ -35,8 +36,6 @@ from perception.types import Scene, View
 
 SAMPLE = 20_000
 """Sparse points by which the scene is cut."""
-GRID, HIDDEN = 16, 1.3
-"""A point is hidden from a photo if it is HIDDEN times as far as the nearest point in its cell of GRID × GRID."""
 SEEN = 0.15
 """Least share of a photo's points in a block's box for which the block is trained on a photo from outside."""
 LEAST_GAIN = 0.85
@@ -80,22 +79,6 @@ def cut(scene: Scene, most: int) -> list[Block]:
 
 def _sample(points: np.ndarray) -> np.ndarray:
     return points[:: -(-len(points) // SAMPLE)]
-
-
-def visible_points(view: View, points: np.ndarray) -> np.ndarray:
-    """[P] bool: the points [P, 3] in the photo that no nearer points hide."""
-    pose = view.camera_from_world
-    x, y, z = pose[:3, :3] @ points.T + pose[:3, 3:]
-    front = z > 1e-6
-    depth = np.where(front, z, 1.0)
-    u = (view.K[0, 0] * x / depth + view.K[0, 2]) / view.width
-    v = (view.K[1, 1] * y / depth + view.K[1, 2]) / view.height
-    inside = front & (u >= 0) & (u < 1) & (v >= 0) & (v < 1)
-    cell = (v[inside] * GRID).astype(int) * GRID + (u[inside] * GRID).astype(int)
-    nearest = np.full(GRID * GRID, np.inf)
-    np.minimum.at(nearest, cell, z[inside])
-    inside[inside] = z[inside] <= HIDDEN * nearest[cell]
-    return np.asarray(inside)
 
 
 def _halved(block: Block, points: np.ndarray, seen: np.ndarray, centres: np.ndarray, most: int) -> list[Block]:

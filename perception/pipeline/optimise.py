@@ -18,6 +18,7 @@ from perception.gaussians.depth_start import start_on_surface
 from perception.gaussians.model import Gaussians, Nearby, from_points
 from perception.gaussians.photos import load_all, with_labels
 from perception.gaussians.state import TrainRecord, sized
+from perception.gaussians.stereo import with_stereo
 from perception.gaussians.train import Trainer
 from perception.gaussians.views import TrainingView, surface_depth
 from perception.io.memory import DiskArrays, Keep
@@ -114,12 +115,18 @@ def optimise(
     `run.work` on, if there is one."""
     label_by_tasks(run, training, source)
     photos = Photos.load(run, training, held_out)
+    if run.config.losses.depth_weight > 0 and scene.report.get("points_from") != "random":
+        with run.stage("stereo"):
+            photos = replace(photos, views=with_stereo(training, photos.views, scene.points, run.progress))
     config = sized(run.config, len(photos.views), largest_budget(memory_limit()))
     start = initial_gaussians(scene, config, photos.views)
     trainer = Trainer(start, photos.views, config, photos.held, run.device, box)
     if config != run.config:
         size = f"{config.train.iterations} iterations, at most {config.train.budget} Gaussians"
         trainer.record.decisions.append(f"size: {size}, for {len(photos.views)} photos")
+    depths = [view.depth for view in photos.views if view.depth is not None and not view.measured]
+    if found := [float((depth > 0).double().mean()) for depth in depths]:
+        trainer.record.decisions.append(f"stereo: depth in {np.mean(found):.0%} of the pixels of {len(found)} photos")
     masks_enter = GEOMETRY_START if source.needs_depth else config.losses.start
     observer = TrainingObserver(run.work, run.mark, source.identity, masks_enter, run.progress)
     observer.take_up(trainer)

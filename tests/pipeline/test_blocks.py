@@ -17,10 +17,11 @@ import torch
 from perception.config import MapConfig, load_config
 from perception.errors import InputError
 from perception.gaussians.model import from_points
+from perception.gaussians.stereo import visible_points
 from perception.geometry import camera_centres
 from perception.map.write import Map
 from perception.pipeline import blocks as module
-from perception.pipeline.blocks import APART, cut, joined, nearby_rows, optimise_block, visible_points
+from perception.pipeline.blocks import APART, cut, joined, nearby_rows, optimise_block
 from perception.pipeline.checkpoint import work_folder
 from perception.pipeline.mapping import build_map
 from perception.pipeline.optimise import Run
