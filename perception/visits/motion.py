@@ -1,0 +1,298 @@
+"""Which new thing of a visit is which thing that no longer stands where it stood, and how it moved.
+
+Two things are compared by registration: the points of the new one, with their colours, are brought onto those of the
+old one (ICP, Besl and McKay 1992) from many starting rotations. The best few motions are then judged by the photos, by
+the same signs as a thing that did not move: carried to the new spot, would the photos say that it stands there? All
+pairs are assigned jointly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from perception.gaussians.model import Gaussians
+from perception.gaussians.views import TrainingView
+from perception.geometry import nearest_rotation, rotations
+from perception.visits.evidence import Signs, signs_of
+from perception.visits.look import Look, look
+
+YAWS = 12
+"""Starting rotations about the vertical; the 24 that map a cube's axes to each other are tried as well."""
+ROUGH, FINE, BEST = 150, 800, 6
+"""Points of the new thing in the first rounds of all starts, and in the last rounds of the BEST ones."""
+ROUNDS = (6, 25)
+TRIMMED = 0.8
+"""Share of the new points that are compared: the rest are of neighbours, or were hidden in the first visit."""
+COLOUR = 1.0
+"""Radii of a thing that a difference of colour of 1 counts as."""
+SIZES = (0.4, 2.0)
+"""Least and largest size of the new thing relative to the old one: a new thing may be half hidden."""
+JUDGED = 6
+"""Photos by which a motion is judged: those that show most of the new thing."""
+MARGIN = 0.3
+"""Of the cut around a thing in a photo, relative to its sides."""
+TURNED = 15.0
+"""Degrees from which two motions are different ones."""
+HOPELESS = -4.0
+"""Log-odds of a first guess below which a motion is not refined."""
+STEP, LEAST_STEP = 0.2, 0.02
+"""Steps of a motion in refinement: radii of the thing, and radians."""
+BINS = 6
+"""Of each colour in the histograms by which pairs are chosen."""
+CLOSE = 1.5
+"""Log-odds within which two motions, or two look-alikes, cannot be told apart."""
+
+
+@dataclass(frozen=True)
+class Points:
+    """Of one thing: points [P, 3] float64, colors [P, 3] in [0, 1]."""
+
+    points: np.ndarray
+    colors: np.ndarray
+
+    @classmethod
+    def of(cls, gaussians: Gaussians, least: float = 0.1) -> Points:
+        """The solid Gaussians' means and colours."""
+        solid = gaussians.opacities.numpy() >= least
+        return cls(gaussians.means.double().numpy()[solid], gaussians.base_colors.double().numpy()[solid].clip(0, 1))
+
+    @property
+    def radius(self) -> float:
+        """Root of the mean squared distance to the centre."""
+        return float(np.sqrt(((self.points - self.points.mean(axis=0)) ** 2).sum(axis=1).mean()))
+
+    def some(self, count: int) -> Points:
+        """An even selection of at most about `count` points."""
+        every = max(1, len(self.points) // count)
+        return Points(self.points[::every], self.colors[::every])
+
+
+@dataclass(frozen=True)
+class Motion:
+    """new_from_old [4, 4] of a thing; signs: of the photos for the thing carried there; ambiguous: another motion
+    explains them as well."""
+
+    new_from_old: np.ndarray
+    signs: Signs
+    ambiguous: bool = False
+
+
+def register(old: Points, new: Points, up: np.ndarray) -> list[tuple[float, np.ndarray]]:
+    """(mean residual in radii of the old thing, new_from_old [4, 4]) of the best motions, the best first."""
+    from scipy.spatial import cKDTree
+
+    radius = max(old.radius, 1e-9)
+    tree = cKDTree(np.concatenate([old.points / radius, COLOUR * old.colors], axis=1))
+    middle_old, middle_new = (np.median(each.points, axis=0) for each in (old, new))
+    starts = []
+    for rotation in _starts(up):
+        start = np.eye(4)
+        start[:3, :3], start[:3, 3] = rotation, middle_new - rotation @ middle_old
+        starts.append(_icp(tree, old, new.some(ROUGH), start, radius, ROUNDS[0]))
+    starts.sort(key=lambda found: found[0])
+    fine = [_icp(tree, old, new.some(FINE), start, radius, ROUNDS[1]) for _, start in starts[: 2 * BEST]]
+    distinct: list[tuple[float, np.ndarray]] = []
+    for found in sorted(fine, key=lambda found: found[0]):
+        if all(angle_between(found[1], other[1]) > TURNED for other in distinct):
+            distinct.append(found)
+    return distinct[:BEST]
+
+
+def _starts(up: np.ndarray) -> list[np.ndarray]:
+    from scipy.spatial.transform import Rotation
+
+    turns = Rotation.from_rotvec(np.arange(YAWS)[:, None] * (2 * np.pi / YAWS) * up).as_matrix()
+    return [*turns, *Rotation.create_group("O").as_matrix()]
+
+
+def _icp(
+    tree: object, old: Points, new: Points, start: np.ndarray, radius: float, rounds: int
+) -> tuple[float, np.ndarray]:
+    pose, residual = start, np.inf
+    for _ in range(rounds):
+        back = (new.points - pose[:3, 3]) @ pose[:3, :3]
+        distance, nearest = tree.query(np.concatenate([back / radius, COLOUR * new.colors], axis=1))  # type: ignore[attr-defined]
+        kept = distance <= np.quantile(distance, TRIMMED)
+        residual = float(distance[kept].mean())
+        a, b = old.points[nearest[kept]], new.points[kept]
+        rotation = nearest_rotation((b - b.mean(axis=0)).T @ (a - a.mean(axis=0)))
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, b.mean(axis=0) - rotation @ a.mean(axis=0)
+    return residual, pose
+
+
+def angle_between(a: np.ndarray, b: np.ndarray) -> float:
+    """Degrees between the rotations of two motions."""
+    cosine = (np.trace(a[:3, :3] @ b[:3, :3].T) - 1) / 2
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def carried(gaussians: Gaussians, new_from_old: np.ndarray) -> Gaussians:
+    """The Gaussians of a thing moved by a rigid motion [4, 4], with their view-dependent colours."""
+    from scipy.spatial.transform import Rotation
+
+    rotation, shift = new_from_old[:3, :3], new_from_old[:3, 3]
+    means = gaussians.means.double().numpy() @ rotation.T + shift
+    turned = Rotation.from_matrix(rotation @ rotations(gaussians.quats.double().numpy())).as_quat()[:, [3, 0, 1, 2]]
+    return replace(
+        gaussians,
+        means=torch.from_numpy(means.astype(np.float32)),
+        quats=torch.from_numpy(turned.astype(np.float32)),
+        sh=turned_harmonics(gaussians.sh, rotation),
+    )
+
+
+def turned_harmonics(sh: torch.Tensor, rotation: np.ndarray) -> torch.Tensor:
+    """Coefficients [N, K, 3] of the same colours after a rotation [3, 3]: Y(d) sh' = Y(Rᵀ d) sh for many directions d."""
+    count = sh.shape[1]
+    if count == 1:
+        return sh
+    directions = np.random.default_rng(0).normal(size=(64, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    turn = np.linalg.lstsq(harmonics(directions)[:, :count], harmonics(directions @ rotation)[:, :count], rcond=None)[0]
+    return torch.einsum("ij,njc->nic", torch.from_numpy(turn.astype(np.float32)), sh)
+
+
+def harmonics(d: np.ndarray) -> np.ndarray:
+    """The real spherical harmonics [P, 16] of directions d [P, 3] as 3DGS orders and signs them."""
+    x, y, z = d.T
+    xx, yy, zz = x * x, y * y, z * z
+    return np.stack([
+        np.full_like(x, 0.28209479177387814),
+        -0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x,
+        1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (2 * zz - xx - yy),
+        -1.0925484305920792 * x * z, 0.5462742152960396 * (xx - yy),
+        -0.5900435899266435 * y * (3 * xx - yy), 2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4 * zz - xx - yy), 0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+        -0.4570457994644658 * x * (4 * zz - xx - yy), 1.445305721320277 * z * (xx - yy),
+        -0.5900435899266435 * x * (xx - 3 * yy),
+    ], axis=1)  # fmt: skip
+
+
+# ------------------------------------------------------------------ judged by the photos
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A part of a photo: view and measured depth of it, and the Gaussians that it may show beside a thing."""
+
+    view: TrainingView
+    measured: np.ndarray
+    scene: Gaussians
+
+
+def cuts_of(looks: Sequence[Look], new: Gaussians, scene: Gaussians) -> list[Cut]:
+    """The parts of the JUDGED photos that show most of a new thing. scene: all else."""
+    found = [cut for shown in looks if (cut := _bounds(shown, new.means.double().numpy())) is not None]
+    found.sort(key=lambda cut: -cut[0])
+    return [_cut(shown, low, high, scene) for _, shown, low, high in found[:JUDGED]]
+
+
+def _bounds(shown: Look, points: np.ndarray) -> tuple[int, Look, np.ndarray, np.ndarray] | None:
+    """(pixels, look, corners) of the part of a photo around points [P, 3]; None where it shows less than half."""
+    pixel, z = _projected(shown, points)
+    size = np.array(shown.mapped.shape[::-1])
+    inside = (z > 1e-3) & ((pixel >= 0) & (pixel < size)).all(axis=1)
+    if inside.mean() < 0.5:
+        return None
+    low, high = np.quantile(pixel[inside], [0.01, 0.99], axis=0)
+    margin = MARGIN * (high - low) + 4
+    low, high = np.maximum(np.floor(low - margin), 0).astype(int), np.minimum(np.ceil(high + margin), size).astype(int)
+    return None if (high - low < 8).any() else (int((high - low).prod()), shown, low, high)
+
+
+def _projected(shown: Look, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels [P, 2] and depths [P] of points [P, 3]."""
+    pose, K = shown.view.camera_from_world.double().numpy(), shown.view.K.double().numpy()
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    z = local[:, 2]
+    return local[:, :2] / np.where(np.abs(z) > 1e-6, z, 1e-6)[:, None] * np.diag(K)[:2] + K[:2, 2], z
+
+
+def _cut(shown: Look, low: np.ndarray, high: np.ndarray, scene: Gaussians) -> Cut:
+    view, part = shown.view, np.s_[low[1] : high[1], low[0] : high[0]]
+    K = view.K.clone()
+    K[:2, 2] -= torch.from_numpy(low.astype(np.float32))
+    images = {name: getattr(view, name) for name in ("photo", "labels", "weight")}
+    own = {name: image[part].contiguous() for name, image in images.items() if image is not None}
+    pixel, z = _projected(shown, scene.means.double().numpy())
+    reach = 3 * scene.scales.max(dim=1).values.double().numpy() / np.maximum(z, 1e-6) * float(view.K[0, 0])
+    near = (z > 0) & ((pixel + reach[:, None] > low) & (pixel - reach[:, None] < high)).all(axis=1)
+    return Cut(
+        replace(view, K=K, depth=None, **own), shown.measured[part], scene.rows(torch.from_numpy(near.nonzero()[0]))
+    )
+
+
+def best_motion(old: Gaussians, new: Gaussians, cuts: Sequence[Cut], up: np.ndarray, depth: float) -> Motion | None:
+    """The motion from an old thing to a new one, in `cuts_of` it; None where they differ. depth: smallest extent of the
+    old thing."""
+    a, b = Points.of(old), Points.of(new)
+    if not cuts or min(len(a.points), len(b.points)) < 8 or not SIZES[0] <= b.radius / max(a.radius, 1e-9) <= SIZES[1]:
+        return None
+    motions = [(judged(old, pose, cuts, depth), pose) for _, pose in register(a, b, up)]
+    motions.sort(key=lambda found: -found[0].log_odds)
+    if motions[0][0].log_odds < HOPELESS:
+        return Motion(motions[0][1], motions[0][0])
+    motions = [refined(old, pose, cuts, depth, a.radius) for _, pose in motions[:2]]
+    motions.sort(key=lambda found: -found[0].log_odds)
+    (signs, pose), others = motions[0], motions[1:]
+    alike = any(s.log_odds > signs.log_odds - CLOSE and angle_between(pose, other) > TURNED for s, other in others)
+    return Motion(pose, signs, alike)
+
+
+def judged(old: Gaussians, pose: np.ndarray, cuts: Sequence[Cut], depth: float) -> Signs:
+    """What the photos say about the old thing, carried by `pose`."""
+    thing, found = carried(old, pose), []
+    for cut in cuts:
+        ids = np.full(len(cut.scene) + len(thing), -1, np.int32)
+        ids[len(cut.scene) :] = 0
+        found.append(look(Gaussians.concatenate([cut.scene, thing]), ids, cut.view, cut.measured))
+    return signs_of(found, [0], np.ones(1), np.array([depth]))[0]
+
+
+def refined(
+    old: Gaussians, pose: np.ndarray, cuts: Sequence[Cut], depth: float, radius: float
+) -> tuple[Signs, np.ndarray]:
+    """The motion near `pose` that the photos support best: steps along and about three axes, halved where none helps."""
+    from scipy.spatial.transform import Rotation
+
+    middle = np.median(old.means.double().numpy(), axis=0)
+    best, step = judged(old, pose, cuts, depth), STEP
+    while step >= LEAST_STEP:
+        tried = []
+        for axis, sign in ((axis, sign) for axis in range(6) for sign in (1, -1)):
+            change = np.zeros(6)
+            change[axis] = sign * step
+            moved = np.eye(4)
+            moved[:3, :3] = Rotation.from_rotvec(change[3:]).as_matrix() @ pose[:3, :3]
+            moved[:3, 3] = pose[:3, :3] @ middle + pose[:3, 3] + radius * change[:3] - moved[:3, :3] @ middle
+            tried.append((judged(old, moved, cuts, depth), moved))
+        signs, moved = max(tried, key=lambda found: found[0].log_odds)
+        if signs.log_odds > best.log_odds:
+            best, pose = signs, moved
+        else:
+            step /= 2
+    return best, pose
+
+
+def looks_alike(old: Gaussians, new: Gaussians) -> float:
+    """Share in [0, 1] that the histograms of the colours of two things have in common."""
+    histograms = []
+    for each in (old, new):
+        colors = Points.of(each).colors
+        counts = np.histogramdd(colors, bins=BINS, range=[(0, 1)] * 3)[0]
+        histograms.append(counts / max(counts.sum(), 1))
+    return float(np.minimum(*histograms).sum())
+
+
+def assigned(odds: np.ndarray) -> list[tuple[int, int]]:
+    """Pairs (old, new) of the joint assignment with the largest sum of log-odds [O, N], of those above 0."""
+    from scipy.optimize import linear_sum_assignment
+
+    gain = np.maximum(np.where(np.isfinite(odds), odds, 0), 0)
+    rows, columns = linear_sum_assignment(-gain)
+    return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if gain[i, j] > 0]
