@@ -22,7 +22,7 @@ from perception.visits.look import Look, look
 
 YAWS = 12
 """Starting rotations about the vertical; the 24 that map a cube's axes to each other are tried as well."""
-ROUGH, FINE, BEST = 150, 800, 6
+ROUGH, FINE, BEST = 150, 600, 4
 """Points of the new thing in the first rounds of all starts, and in the last rounds of the BEST ones."""
 ROUNDS = (6, 25)
 TRIMMED = 0.8
@@ -31,7 +31,7 @@ COLOUR = 1.0
 """Radii of a thing that a difference of colour of 1 counts as."""
 SIZES = (0.4, 2.0)
 """Least and largest size of the new thing relative to the old one: a new thing may be half hidden."""
-JUDGED = 6
+JUDGED = 4
 """Photos by which a motion is judged: those that show most of the new thing."""
 MARGIN = 0.3
 """Of the cut around a thing in a photo, relative to its sides."""
@@ -39,6 +39,10 @@ TURNED = 15.0
 """Degrees from which two motions are different ones."""
 HOPELESS = -4.0
 """Log-odds of a first guess below which a motion is not refined."""
+ALIKE = 4
+"""Old things, most alike in colour, with which a new one is compared."""
+GAINS = 0.02
+"""Log-odds that a step of refinement must gain."""
 STEP, LEAST_STEP = 0.2, 0.02
 """Steps of a motion in refinement: radii of the thing, and radians."""
 BINS = 6
@@ -227,19 +231,23 @@ def _cut(shown: Look, low: np.ndarray, high: np.ndarray, scene: Gaussians) -> Cu
     )
 
 
-def best_motion(old: Gaussians, new: Gaussians, cuts: Sequence[Cut], up: np.ndarray, depth: float) -> Motion | None:
-    """The motion from an old thing to a new one, in `cuts_of` it; None where they differ. depth: smallest extent of the
-    old thing."""
+def motions_of(
+    old: Gaussians, new: Gaussians, cuts: Sequence[Cut], up: np.ndarray, depth: float
+) -> list[tuple[Signs, np.ndarray]]:
+    """Signs and new_from_old [4, 4] of the likeliest motions from an old thing to a new one, in `cuts_of` it, the best
+    first; none where their sizes differ. depth: smallest extent of the old thing."""
     a, b = Points.of(old), Points.of(new)
     if not cuts or min(len(a.points), len(b.points)) < 8 or not SIZES[0] <= b.radius / max(a.radius, 1e-9) <= SIZES[1]:
-        return None
-    motions = [(judged(old, pose, cuts, depth), pose) for _, pose in register(a, b, up)]
-    motions.sort(key=lambda found: -found[0].log_odds)
-    if motions[0][0].log_odds < HOPELESS:
-        return Motion(motions[0][1], motions[0][0])
-    motions = [refined(old, pose, cuts, depth, a.radius) for _, pose in motions[:2]]
-    motions.sort(key=lambda found: -found[0].log_odds)
-    (signs, pose), others = motions[0], motions[1:]
+        return []
+    found = [(judged(old, pose, cuts, depth), pose) for _, pose in register(a, b, up)]
+    return sorted(found, key=lambda motion: -motion[0].log_odds)
+
+
+def settled(old: Gaussians, found: Sequence[tuple[Signs, np.ndarray]], cuts: Sequence[Cut], depth: float) -> Motion:
+    """The best of the two best motions after refinement, and whether the other explains the photos as well."""
+    refine = [refined(old, pose, cuts, depth) for _, pose in found[:2]]
+    refine.sort(key=lambda motion: -motion[0].log_odds)
+    (signs, pose), others = refine[0], refine[1:]
     alike = any(s.log_odds > signs.log_odds - CLOSE and angle_between(pose, other) > TURNED for s, other in others)
     return Motion(pose, signs, alike)
 
@@ -254,28 +262,25 @@ def judged(old: Gaussians, pose: np.ndarray, cuts: Sequence[Cut], depth: float) 
     return signs_of(found, [0], np.ones(1), np.array([depth]))[0]
 
 
-def refined(
-    old: Gaussians, pose: np.ndarray, cuts: Sequence[Cut], depth: float, radius: float
-) -> tuple[Signs, np.ndarray]:
-    """The motion near `pose` that the photos support best: steps along and about three axes, halved where none helps."""
+def refined(old: Gaussians, pose: np.ndarray, cuts: Sequence[Cut], depth: float) -> tuple[Signs, np.ndarray]:
+    """The motion near `pose` that the photos support best: steps along and about three axes, halved when none helps."""
     from scipy.spatial.transform import Rotation
 
-    middle = np.median(old.means.double().numpy(), axis=0)
+    points = Points.of(old)
+    middle, radius = points.points.mean(axis=0), points.radius
     best, step = judged(old, pose, cuts, depth), STEP
     while step >= LEAST_STEP:
-        tried = []
+        better = False
         for axis, sign in ((axis, sign) for axis in range(6) for sign in (1, -1)):
             change = np.zeros(6)
             change[axis] = sign * step
             moved = np.eye(4)
             moved[:3, :3] = Rotation.from_rotvec(change[3:]).as_matrix() @ pose[:3, :3]
             moved[:3, 3] = pose[:3, :3] @ middle + pose[:3, 3] + radius * change[:3] - moved[:3, :3] @ middle
-            tried.append((judged(old, moved, cuts, depth), moved))
-        signs, moved = max(tried, key=lambda found: found[0].log_odds)
-        if signs.log_odds > best.log_odds:
-            best, pose = signs, moved
-        else:
-            step /= 2
+            signs = judged(old, moved, cuts, depth)
+            if signs.log_odds > best.log_odds + GAINS:
+                best, pose, better = signs, moved, True
+        step = step if better else step / 2
     return best, pose
 
 
@@ -289,10 +294,10 @@ def looks_alike(old: Gaussians, new: Gaussians) -> float:
     return float(np.minimum(*histograms).sum())
 
 
-def assigned(odds: np.ndarray) -> list[tuple[int, int]]:
-    """Pairs (old, new) of the joint assignment with the largest sum of log-odds [O, N], of those above 0."""
+def assigned(odds: np.ndarray, least: float = 0.0) -> list[tuple[int, int]]:
+    """Pairs (old, new) of the joint assignment with the largest sum of log-odds [O, N] above `least`."""
     from scipy.optimize import linear_sum_assignment
 
-    gain = np.maximum(np.where(np.isfinite(odds), odds, 0), 0)
+    gain = np.maximum(np.where(np.isfinite(odds), odds - least, 0), 0)
     rows, columns = linear_sum_assignment(-gain)
     return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if gain[i, j] > 0]
