@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+from datetime import datetime
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -64,6 +65,14 @@ def _photo_name(value: Any) -> str:
     return str(value)
 
 
+def _moment(value: str) -> str:
+    try:
+        datetime.strptime(value, "%Y-%m-%dT%H:%M:%SZ")
+    except ValueError:
+        raise ValueError("expected a time in UTC such as 2026-11-25T19:41:58Z") from None
+    return value
+
+
 def _similarity(value: list[list[float]]) -> list[list[float]]:
     check_similarity(value, "the matrix")
     return value
@@ -95,6 +104,7 @@ Length = Annotated[float, Field(ge=0, le=FARTHEST)]
 Positive = Annotated[float, Field(gt=0, le=FARTHEST)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Text = Annotated[str, AfterValidator(_text)]
+Moment = Annotated[str, AfterValidator(_moment)]
 PathText = Annotated[Any, AfterValidator(_path)]
 FileName = Annotated[str, AfterValidator(_plain_name)]
 PhotoName = Annotated[Any, AfterValidator(_photo_name)]

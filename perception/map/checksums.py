@@ -18,7 +18,7 @@ EDITABLE = "instances.json"
 """Users may edit labels in this file by hand, so a changed checksum is reported and not an error."""
 DATA = (
     *("gaussians.ply", "features.npy", "instance_ids.npy", "membership.npy"),
-    *("cameras.npz", "index.npz", "language.npz", "parts.npz", "groups.npz"),
+    *("cameras.npz", "index.npz", "language.npz", "parts.npz", "groups.npz", "past.npz"),
 )
 """Names of a map's other files, in all format versions."""
 _UNFINISHED = re.compile(r"^\.(.+)\.new-\d+-\w{8}$")

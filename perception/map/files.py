@@ -18,12 +18,13 @@ from perception.io.documents import DAMAGE, brief
 from perception.io.json_shapes import parsed
 from perception.io.ply import map_ply
 from perception.map.checksums import EDITABLE, FACTS, STORE, check_file, check_sizes, damaged
+from perception.map.history import is_removed
 from perception.map.model import check_archive, check_facts, check_ids, check_instances
 from perception.photos.view_json import views_of_facts
 
 FORMAT_VERSION = 2
 _ARRAYS = {"features": 2, "instance_ids": 1, "membership": 1}
-ARCHIVES = ("language", "parts", "groups")
+ARCHIVES = ("language", "parts", "groups", "past")
 _TRIES = 5
 
 Signature = tuple[tuple[int, int, int], ...]
@@ -98,7 +99,7 @@ class MapFiles:
             return getattr(self, name)
         if name == "views":
             return views_of_facts(self.facts, self.path / FACTS)
-        if name in ("language", "parts", "groups"):
+        if name in ARCHIVES:
             arrays = self._unpack(name)
             with _damage_in(self.path / f"{name}.npz"):
                 check_archive(name, arrays, self.instances, len(self._rows))
@@ -106,7 +107,7 @@ class MapFiles:
         self._check_contents()
         if name == "instance_ids":
             with _damage_in(self.path / f"{name}.npy"):
-                check_ids(self._arrays[name], [entry["id"] for entry in self.instances])
+                check_ids(self._arrays[name], [e["id"] for e in self.instances if not is_removed(e)])
         if name in _ARRAYS:
             return np.array(self._arrays[name])
         try:

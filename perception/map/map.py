@@ -53,7 +53,7 @@ T = TypeVar("T")
 M = TypeVar("M", bound="Map")
 GAUSSIANS = ("means", "quats", "log_scales", "opacity_logits", "sh", "features", "instance_ids", "membership")
 """Fields with one row per Gaussian."""
-_FIELDS = (*GAUSSIANS, "instances", "info", "views", "language", "parts", "groups")
+_FIELDS = (*GAUSSIANS, "instances", "info", "views", "language", "parts", "groups", "past")
 
 
 def language_in(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -113,10 +113,10 @@ class Map:
     Arrays are float32: means [N, 3], quats [N, 4] wxyz, log_scales [N, 3], opacity_logits [N], sh [N, K, 3], as the PLY
     stores them; features [N, D], membership [N], and instance_ids [N] int32, −1 = none. instances: the list of
     instances.json. info: map.json without the views. views: the photos it was made from, sorted by name, `StoredView`
-    in a map read from disk. language, parts, groups: named arrays (see map.write), possibly empty. index: the points
-    of each instance. Reading a field raises InputError naming the file when it is damaged. The folder may be replaced
-    by another map meanwhile. This type needs no torch; training uses `gaussians.model.Gaussians`, which holds the same
-    values as torch tensors.
+    in a map read from disk. language, parts, groups, past: named arrays (see map.write), possibly empty. index: the
+    points of each instance. Reading a field raises InputError naming the file when it is damaged. The folder may be
+    replaced by another map meanwhile. This type needs no torch; training uses `gaussians.model.Gaussians`, which holds
+    the same values as torch tensors.
 
     >>> gmap = Map.open(Path("kitchen.gsmap"))
     >>> gmap.means.shape, gmap.means.dtype, gmap.instance_ids.min()
@@ -137,6 +137,7 @@ class Map:
     language: Lazy[dict[str, np.ndarray]] = Lazy(dict)
     parts: Lazy[dict[str, np.ndarray]] = Lazy(dict)
     groups: Lazy[dict[str, np.ndarray]] = Lazy(dict)
+    past: Lazy[dict[str, np.ndarray]] = Lazy(dict)
     path: Path | None = None
     files: MapFiles | None = None
     _warned: bool = field(default=False, init=False)
@@ -194,6 +195,11 @@ class Map:
     def map_id(self) -> str:
         """Short identifier of the map and its labels; it changes when either changes."""
         return "unsaved" if self.files is None else self.files.map_id
+
+    @property
+    def newest_visit(self) -> int:
+        """The number of the newest visit (see `map.history`), 0 in a map of one."""
+        return len(self.info.get("visits") or [0]) - 1
 
     def setting(self, group: str, name: str, default: Any) -> Any:
         """The setting GROUP.NAME that the map was made with; `default` where it is not recorded, or is none."""

@@ -16,18 +16,17 @@ from perception.io.json_shapes import (
     Direction,
     FileName,
     Length,
-    Matrix3,
     Number,
     PathText,
     Point,
     Positive,
     Share,
-    Sides,
     Similarity,
     Text,
     check,
     typed,
 )  # fmt: skip
+from perception.map.history import AABB, OBB, RECORD, VISIT, check_record
 from perception.photos.view_json import VIEW
 
 PREFIX = "language_"
@@ -63,17 +62,17 @@ FACTS = typed({
     "quality?": _QUALITY, "training?": _TRAINING, "seconds?": dict[str, Length], "peak_memory_mib?": Length,
     "depth?": _DEPTH_USE | None, "scale?": _SCALE | None, "gravity?": _GRAVITY | None, "map_from_input?": Similarity,
     "files?": dict[FileName, typed({"bytes": Bytes, "sha256": Text})],  # type: ignore[misc]
-    "sha256?": Text, "views?": [VIEW],
+    "sha256?": Text, "views?": [VIEW], "visits?": [VISIT],
 })  # fmt: skip
 """map.json. Maps of earlier releases lack some keys."""
 _TEXTS = typed([{"text": Text, "score": Share}])
 _PART = {
     "id": Count, "label?": Text | None, "score": Share, "num_gaussians": Count, "centroid": Point,
-    "obb": {"center": Point, "rotation": Matrix3, "extent": Sides}, "aabb?": {"min": Point, "max": Point},
+    "obb": OBB, "aabb?": AABB,
     "views?": Count, "texts?": _TEXTS, "hidden?": bool, "parent?": Count,
 }  # fmt: skip
-INSTANCES, INSTANCE = typed({"instances": [Any]}), typed({**_PART, "parts?": [_PART]})
-_KNOWN = {key.rstrip("?") for key in (*_PART, "parts")}
+INSTANCES, INSTANCE = typed({"instances": [Any]}), typed({**_PART, **RECORD, "parts?": [_PART]})
+_KNOWN = {key.rstrip("?") for key in (*_PART, *RECORD, "parts")}
 _STORED = {"map": PathText, "map_id": Text, "frame": Text, "metric": bool, "instances": Count, "file": FileName}
 STORED = typed({"encoder": {"name": Text, "identity": Text}, "maps": [_STORED]})
 """store.json."""
@@ -89,16 +88,21 @@ def check_facts(value: Any) -> None:
     """ValueError unless `value`, of map.json, fits the model and can be written again."""
     check(FACTS, value)
     json.dumps(value, allow_nan=False)  # 1e999 is read as infinity
+    visits = len(value.get("visits") or [0])
+    for n, view in enumerate(value.get("views", ())):
+        if view.get("visit", 0) >= visits:
+            raise ValueError(f"views[{n}].visit: is {view['visit']}, the map has {visits} visits")
 
 
 def check_instances(value: Any, facts: dict[str, Any]) -> None:
     """ValueError unless `value`, of instances.json, fits the model and `facts`, of map.json."""
     check(INSTANCES, value)
-    entries, seen = value["instances"], set()
+    entries, seen, visits = value["instances"], set(), len(facts.get("visits") or [0])
     for n, instance in enumerate(entries):
         check(
             INSTANCE, instance, f"instances[{n}]"
         )  # each alone: what is checked is copied, and 20,000 copies cost time
+        check_record(instance, visits)
         for entry in (instance, *instance.get("parts", ())):
             if entry["id"] in seen:
                 raise ValueError(f"id: {entry['id']} occurs twice")
@@ -144,9 +148,16 @@ def _check_language(arrays: Arrays, rows: int) -> None:
 
 
 def check_archive(name: str, arrays: Arrays, instances: list[dict[str, Any]], gaussians: int) -> None:
-    """ValueError unless the arrays of `name`.npz (language, parts or groups), if any, fit the instances and the number
-    of Gaussians."""
+    """ValueError unless the arrays of `name`.npz (language, parts, groups or past), if any, fit the instances and the
+    number of Gaussians."""
     if not arrays:
+        return None
+    if name == "past":
+        _check_arrays(arrays, {"means": ("f", ("M", 3)), "ids": ("i", ("M",)), "until": ("i", ("M",))})
+        spots = {(entry["id"], spot["until"]) for entry in instances for spot in entry.get("past", ())}
+        for pair in zip(*(np.unique(np.stack([arrays["ids"], arrays["until"]]), axis=1).tolist()), strict=True):
+            if pair not in spots:
+                raise ValueError(f"ids: instance {pair[0]} has no past until visit {pair[1]} in instances.json")
         return None
     if name == "language":
         return _check_language(arrays, len(instances))

@@ -6,6 +6,7 @@ parts.npz       ids [N] int32: the part each Gaussian belongs to (−1 = none; a
                 language_*: as language.npz, one row per part in ascending id
 groups.npz      instances that may be one thing: of [I] int32, group of each instance in the order of instances.json,
                 −1 = none; scores [G] float32; language_* as in parts.npz (absent without groups)
+past.npz        where things stood at earlier visits (see `map.history`; absent without such things)
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ def write_map(path: Path, gmap: Map, keep_report: bool = False, fresh: bool = Fa
         np.save(folder / "membership.npy", gmap.membership.astype(np.float32))
         if gmap.language:
             np.savez_compressed(folder / "language.npz", **gmap.language)  # type: ignore[arg-type]
-        for name, arrays in (("parts", gmap.parts), ("groups", gmap.groups)):
+        for name, arrays in (("parts", gmap.parts), ("groups", gmap.groups), ("past", gmap.past)):
             if arrays:
                 np.savez_compressed(folder / f"{name}.npz", **arrays)  # type: ignore[arg-type]
         _dump(folder / EDITABLE, {"instances": gmap.instances})

@@ -2,7 +2,7 @@
 
 name, K, width, height, camera_from_world, lens, held_out: as in `types.View`. photo: absolute path of the photo.
 photo_beside: its path relative to the map's folder. photo_bytes: its size in bytes; a file of another size is not
-accepted. The last two may be null.
+accepted. The last two may be null. visit: number of the visit that took it (see `map.history`), 0 when it is missing.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from perception.errors import InputError
 from perception.io.atomic import pointed
 from perception.io.json_shapes import (
     Bytes,
+    Count,
     Intrinsics,
     Number,
     PathText,
@@ -49,7 +50,7 @@ _GAIN = Annotated[list[Annotated[float, Field(gt=0, lt=1e3)]], Len(3, 3)]
 _VIEW = {
     "name": PhotoName, "photo": PathText, "K": Intrinsics, "width": Side, "height": Side, "camera_from_world": Pose,
     "lens?": _LENS | None, "held_out?": bool, "photo_beside?": PathText | None, "photo_bytes?": Bytes | None,
-    "depth?": _DEPTH | None, "mask?": PathText | None, "gain?": _GAIN | None,
+    "depth?": _DEPTH | None, "mask?": PathText | None, "gain?": _GAIN | None, "visit?": Count,
 }  # fmt: skip
 VIEW: Any = Annotated[typed(_VIEW), AfterValidator(_pixels)]
 """A view in map.json."""
@@ -61,14 +62,15 @@ class StoredView(View):
 
     photo_beside: str | None = None
     photo_bytes: int | None = None
+    visit: int = 0
 
 
-def stored_view(view: View, folder: Path, held_out: bool = False) -> StoredView:
+def stored_view(view: View, folder: Path, held_out: bool = False, visit: int = 0) -> StoredView:
     """`view` with the record of its photo for the map at `folder`: both paths, and the size (None if missing)."""
     photo = absolute(view.photo)  # links are kept: the user names his photos by them
     K, pose = np.asarray(view.K, np.float64), np.asarray(view.camera_from_world, np.float64)
     own = (view.name, photo, K, view.width, view.height, pose, view.lens, held_out, None, None, view.gain)
-    return StoredView(*own, _relative(photo, folder), _bytes(photo))
+    return StoredView(*own, _relative(photo, folder), _bytes(photo), visit)
 
 
 def moved_record(view: StoredView, before: Path, after: Path) -> StoredView:
@@ -123,6 +125,7 @@ def view_json(view: View) -> dict[str, Any]:
     }
     if isinstance(view, StoredView):
         entry |= {name: getattr(view, name) for name in ("held_out", "photo_beside", "photo_bytes")}
+        entry |= {"visit": view.visit} if view.visit else {}
     if view.depth is not None:
         entry["depth"] = [str(absolute(view.depth.path)), view.depth.scale, _lens_json(view.depth.lens)]
     if view.gain is not None:
@@ -150,6 +153,7 @@ def view_from_json(entry: dict[str, Any]) -> StoredView:
         None if gain is None else (float(gain[0]), float(gain[1]), float(gain[2])),
         beside,
         size,
+        entry.get("visit", 0),
     )
 
 

@@ -37,6 +37,11 @@ class Hit:
     members; points, box and colours are then the part's or the group's. colors(): [P, 3] uint8 of the points, read when
     called; None where they are not known. All of it is in `frame`, in metres when the map is metric.
 
+    In a map of several visits (see `map.history`): state as of the newest visit ("unchanged", "moved", "added",
+    "removed" or "unseen"), last_seen: the visit that saw it last, since: the visit that first found it here, or missed
+    it (removed; the hit is then where it stood), was: [3] centroid of the spot that it left, if any, and stood: the
+    relation and the id of what held a removed thing ("on", 5). None in other maps, and for parts and groups.
+
     A hit of a store also has the path of its `map`, `map_id`, and whether that is `metric`. Its points are read from
     the map's folder when asked for: InputError when that is gone or holds another map.
 
@@ -64,6 +69,11 @@ class Hit:
     map_id: str | None = None
     metric: bool | None = None
     count: int | None = None
+    state: str | None = None
+    last_seen: int | None = None
+    since: int | None = None
+    was: np.ndarray | None = None
+    stood: tuple[str, int] | None = None
 
     @property
     def num_points(self) -> int:
@@ -86,6 +96,7 @@ class Hit:
             obb=move_box(moved, self.obb),
             covariance=linear @ self.covariance @ linear.T,
             frame=self.frame if frame is None else frame,
+            was=None if self.was is None else move_points(moved, np.asarray(self.was, np.float64)),
             distance=None if self.distance is None else self.distance * float(np.cbrt(np.linalg.det(linear))),
         )
 
@@ -111,6 +122,10 @@ class Hit:
         }
         answer |= {} if self.part is None else {"part": self.part}
         answer |= {"instances": list(self.instances)} if self.instances else {}
+        if self.state is not None:
+            answer |= {"state": self.state, "last_seen": self.last_seen, "since": self.since}
+            answer |= {} if self.was is None else {"was": [float(x) for x in self.was]}
+            answer |= {} if self.stood is None else {"stood": dict(zip(("relation", "other"), self.stood, strict=True))}
         if self.map is not None:
             answer |= {"map": self.map, "map_id": self.map_id, "frame": self.frame, "metric": self.metric}
         return answer if self.distance is None else {**answer, "distance": float(self.distance)}

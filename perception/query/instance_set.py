@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from perception.colors import rgb8_from_sh
+from perception.map.history import is_removed, last_seen, since
 from perception.map.map import InstanceIndex, Map, build_index
 from perception.query.hit import Hit
 from perception.types import OrientedBox
@@ -43,6 +44,7 @@ class InstanceSet:
             self._covariance(row),
             self._gmap.frame,
             colors=partial(self._colors, number),
+            **record_of(entry, self._gmap.newest_visit),
         )
 
     def views(self, row: int) -> tuple[str, ...]:
@@ -75,6 +77,18 @@ class InstanceSet:
         return self._covariances[row]
 
     def _colors(self, number: int) -> np.ndarray:
-        """Colours [P, 3] uint8 of the points of the entry with this id, in the order of `index`."""
+        """Colours [P, 3] uint8 of the points of the entry with this id, in the order of `index`; grey where it stood at
+        an earlier visit, as these are not kept."""
         ids = self._gmap.instance_ids if self._ids is None else self._ids
-        return rgb8_from_sh(self._gmap.sh[ids == number, 0])
+        colors, points = rgb8_from_sh(self._gmap.sh[ids == number, 0]), self.index.of(number)
+        return colors if len(colors) == len(points) else np.full(points.shape, 128, np.uint8)
+
+
+def record_of(entry: dict[str, Any], newest: int) -> dict[str, Any]:
+    """The fields of a `Hit` that the record of an entry gives, {} without one."""
+    if "state" not in entry:
+        return {}
+    past = entry.get("past", [])
+    left = past[-1] if past and not past[-1].get("gone") and not is_removed(entry) else None
+    was = None if left is None else np.array(left["centroid"], np.float64)
+    return {"state": entry["state"], "last_seen": last_seen(entry, newest), "since": since(entry), "was": was}

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from perception.errors import InputError
 from perception.geometry import move_points, scale_of
-from perception.map.map import Map
+from perception.map.history import Visit, changes_of, is_removed, last_seen, left, stood, visit_number, visits_of
+from perception.map.map import InstanceIndex, Map, build_index
 from perception.query.hit import Description, Hit, Neighbor
 from perception.query.instance_set import InstanceSet
 from perception.query.naming import likely_names
 from perception.query.nodes import Candidate, Node, Nodes
+from perception.query.past import Spot, present, scene
 from perception.query.ranking import Ranker, answering
-from perception.query.requests import TOP, UnknownInstance, check_prompt
+from perception.query.requests import MAX_TOP, TOP, UnknownInstance, check_prompt
 from perception.query.spatial_index import SpatialIndex
 from perception.query.text_ranking import Encoders, TextRanking
 from perception.query.where import Frame, Where, position_of, tidy
@@ -27,6 +30,7 @@ if TYPE_CHECKING:
 
 _NEIGHBORS = 3
 _LEAST_COLOR = 0.05
+_VIEWS = 4  # earlier visits whose scenes are kept in memory
 
 
 @dataclass(eq=False, repr=False)
@@ -49,6 +53,19 @@ class QueryMap(Map):
     """
 
     encoders: Encoders | None = None
+
+    def __post_init__(self) -> None:
+        self._at = lru_cache(_VIEWS)(lambda visit: self._scene(visit, lambda entry: stood(entry, visit)))
+        self._visit = self.newest_visit
+        self._record: Map | None = None
+        if any(map(is_removed, self.instances)):
+            self._record = Map.of(self)
+            vars(self).update(present(self._record))
+
+    @property
+    def record(self) -> Map:
+        """The map with its removed instances, which `instances` and all answers but those of `gone` leave out."""
+        return self if self._record is None else self._record
 
     @property
     def problem(self) -> str | None:
@@ -75,6 +92,7 @@ class QueryMap(Map):
         if self.problem is None and self.instances:
             _ = self.ranker.shapes
             self.query("thing")
+            self.gone("thing")
 
     # --------------------------------------------------------------- questions
 
@@ -163,6 +181,72 @@ class QueryMap(Map):
             tuple(Neighbor(i, labels.get(i), gap * scale) for gap, i in beside),
         )
 
+    # ------------------------------------------------------------------ visits
+
+    @cached_property
+    def visits(self) -> list[Visit]:
+        """The visits that made the map and brought it up to date, oldest first."""
+        return visits_of(self.info, len(self.views))
+
+    def changes(self, since: int | str = "last") -> list[dict[str, Any]]:
+        """What differs today from what stood as of visit `since`, by default the one before the newest, in the map's
+        frame (`history.changes_of`). InputError for a visit that the map does not have."""
+        return changes_of(self.visits, self.record.instances, visit_number(self.visits, since))
+
+    def at(self, visit: int | str) -> QueryMap:
+        """The map as it stood as of a visit, with the points of then: for prompts and all questions about instances.
+        Gaussians, free space and photos are today's. InputError for a visit that the map does not have."""
+        number = visit_number(self.visits, visit)
+        return self if number == self._visit else self._at(number)
+
+    def gone(
+        self,
+        text: str,
+        top_k: int = TOP,
+        min_score: float | None = None,
+        *,
+        where: Where | None = None,
+        frame: Frame | None = None,
+    ) -> list[Hit]:
+        """As `query`, the instances that are gone and answer `text` when they are compared with all others: hits where
+        they stood last, with `since` and, where it is known, what they `stood` on."""
+        spots = {e["id"]: (e, spot) for e in self.record.instances if (spot := left(e, self._visit)) is not None}
+        if not spots:
+            return []
+        hits: list[Hit] = []
+        for hit in self._last_known.query(text, MAX_TOP, min_score, where=where, frame=frame):
+            if hit.instance_id in spots and len(hits) < top_k:
+                entry, spot = spots[hit.instance_id]
+                until, seen = spot["until"], last_seen(entry, self.newest_visit)
+                then = {"last_seen": min(seen, until), "since": until + 1, "stood": self.at(until).holder(entry["id"])}
+                hits.append(replace(hit, state="removed", **then))
+        return hits
+
+    def holder(self, instance_id: int) -> tuple[str, int] | None:
+        """What holds an instance: the relation, "on", "in" or "attached to", and the other's id; None where nothing
+        does, or it is not known which way is up."""
+        return self._holders.get(instance_id)
+
+    @cached_property
+    def _holders(self) -> dict[int, tuple[str, int]]:
+        from perception.query.scene_graph import held_by
+
+        return held_by(self)
+
+    @cached_property
+    def _last_known(self) -> QueryMap:
+        """This map, and every instance that it does not have any more where it stood last."""
+        return self._scene(self._visit, lambda entry: stood(entry, self._visit) or left(entry, self._visit))
+
+    def _scene(self, visit: int, spot_of: Callable[[Spot], Spot | None]) -> QueryMap:
+        fields = scene(self.record, spot_of)
+        index = fields.pop("index")
+        then = QueryMap.of(self, **fields, encoders=self.encoders)
+        vars(then).update(index=index, _record=self.record, _visit=visit)
+        return then
+
+    # ------------------------------------------------------------------ one instance
+
     def likely_names(self, count: int = 3) -> list[list[str]]:
         """The likeliest names of every instance, best first, in the order of `instances`."""
         return likely_names(self.ranker, count) if self.instances else []
@@ -175,6 +259,10 @@ class QueryMap(Map):
         """The index of this id in instances.json; UnknownInstance when there is none."""
         position = self._positions.get(instance_id)
         if position is None:
+            known = next((e for e in self.record.instances if e["id"] == instance_id), None)
+            if known is not None:
+                when = f"it was not there at visit {self._visit}; another visit may have seen it"
+                raise UnknownInstance(f"instance {instance_id}: {when} (last seen: {last_seen(known, self._visit)})")
             raise UnknownInstance(f"instance {instance_id}: the map has none such; it has {len(self.instances)}")
         return position
 
@@ -221,6 +309,10 @@ class QueryMap(Map):
 
         shares = [(name, float(color_share(palettes[position : position + 1], name)[0])) for name in COLOR_NAMES]
         return tuple(sorted((entry for entry in shares if entry[1] >= _LEAST_COLOR), key=lambda entry: -entry[1]))
+
+    @cached_property
+    def index(self) -> InstanceIndex:
+        return build_index(self.means, self.instance_ids) if self._record is None else self._record.index
 
     @cached_property
     def _positions(self) -> dict[int, int]:

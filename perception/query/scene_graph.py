@@ -66,9 +66,7 @@ def scene_graph(gmap: Map) -> networkx.DiGraph:
     if boxes is None or level is None:
         advice = "map photos of a level camera, or a transforms.json with 'gravity'"
         raise InputError(f"{gmap.path}: which way is up is not known, and a scene graph needs it; {advice}")
-    clouds = [gmap.index.of(entry["id"]) for entry in gmap.instances]
-    points = [cloud[:: -(-len(cloud) // MOST_POINTS) or 1].astype(np.float64) @ level.T for cloud in clouds]
-    held = holders(points, boxes)
+    held = holders(_level_points(gmap, level), boxes)
     beside, rooms = boxes.match("beside"), _rooms(gmap)
     shell = _shells(boxes)
     ids = [int(entry["id"]) for entry in gmap.instances]
@@ -98,6 +96,21 @@ def scene_graph(gmap: Map) -> networkx.DiGraph:
         for i, j in ((a, b), (b, a)) if apart and on[a] is not None and on[a] == on[b] else ():
             graph.add_edge(ids[i], ids[j], relation="next to", score=round(float(beside[a, b]), 3))
     return graph
+
+
+def held_by(gmap: Map) -> dict[int, tuple[str, int]]:
+    """What holds each instance that something holds, by its id: the relation and the other's id. {} where it is not
+    known which way is up."""
+    boxes, level = LevelBoxes.of(gmap), level_from_map(gmap)
+    held = [] if boxes is None or level is None else holders(_level_points(gmap, level), boxes)
+    ids = [int(entry["id"]) for entry in gmap.instances]
+    return {i: (by.relation, ids[by.position]) for i, by in zip(ids, held, strict=False) if by is not None}
+
+
+def _level_points(gmap: Map, level: np.ndarray) -> list[np.ndarray]:
+    """At most MOST_POINTS points [P, 3] of each instance, z up."""
+    clouds = [gmap.index.of(entry["id"]) for entry in gmap.instances]
+    return [cloud[:: -(-len(cloud) // MOST_POINTS) or 1].astype(np.float64) @ level.T for cloud in clouds]
 
 
 def holders(points: list[np.ndarray], boxes: LevelBoxes) -> list[Holder | None]:
