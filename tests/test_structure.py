@@ -26,6 +26,7 @@ LAYERS = """
     gaussians
     language
     instances
+    localise
     query
     evaluate export
     edit report

@@ -16,10 +16,10 @@ from perception.bags.poses import FIXED_FRAMES, Poses, gravity, read_poses
 from perception.bags.read import CAMERA_INFO, IMAGES, Bag, camera_of, decode_image, encoded, open_bag, stamp_of
 from perception.errors import InputError
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
+from perception.inputs.transforms import lens_values
 from perception.io.atomic import atomic_directory
 from perception.map.outputs import check_empty
 from perception.photos.camera_file import camera_info, read_camera, write_camera
-from perception.photos.lens import FISHEYE, PERSPECTIVE
 from perception.photos.video import Chooser
 from perception.types import Lens
 
@@ -172,11 +172,8 @@ def _transforms(
         }
         for name, pose in known.items()
     ]
-    model, names = ("OPENCV_FISHEYE", FISHEYE) if lens.model == "OPENCV_FISHEYE" else ("OPENCV", PERSPECTIVE)
-    keys = ("fl_x", "fl_y", "cx", "cy", *names)
-    data = {"camera_model": model, "w": lens.width, "h": lens.height, **dict(zip(keys, lens.params, strict=False))}
     unit = {"depth_unit_scale_factor": 1 / MILLIMETRES} if depth else {}
-    return {**data, **unit, "metric": True, "frames": frames}  # ROS measures in metres (REP 103)
+    return {**lens_values(lens), **unit, "metric": True, "frames": frames}  # ROS measures in metres (REP 103)
 
 
 def _text(facts: dict[str, Any]) -> str:

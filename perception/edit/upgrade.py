@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.export.render import as_gaussians
+from perception.gaussians.model import as_gaussians
 from perception.gaussians.photos import training_view
 from perception.instances.describe import Load, describe_instances
 from perception.instances.silhouettes import render_silhouettes

@@ -18,10 +18,11 @@ from perception.errors import InputError
 from perception.export.align import align
 from perception.export.depth_views import DepthView, depth_views
 from perception.export.neighbors import nearest_gaussian
-from perception.export.render import as_gaussians, map_views
+from perception.export.render import map_views
 from perception.export.smooth import read_segments, segment_cloud, vote
 from perception.export.spz import write_spz
 from perception.frame.recentre import map_from_input
+from perception.gaussians.model import as_gaussians
 from perception.geometry import check_similarity, move_points, scale_of
 from perception.io.atomic import atomic_file
 from perception.io.cloud import read_cloud, write_cloud

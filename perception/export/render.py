@@ -14,9 +14,9 @@ import torch
 
 from perception.errors import InputError
 from perception.frame.recentre import map_from_input, moved
-from perception.gaussians.model import Gaussians
-from perception.gaussians.views import depth_image, render
-from perception.inputs.transforms import read_frames
+from perception.gaussians.model import Gaussians, as_gaussians
+from perception.gaussians.views import depth_image, render, rgb_image
+from perception.inputs.transforms import in_map_frame, read_frames
 from perception.instances.silhouettes import render_silhouettes
 from perception.io.atomic import atomic_file
 from perception.io.documents import safe_name
@@ -39,8 +39,8 @@ def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[st
 
     rgb: 8-bit PNG. depth: 16-bit PNG, thousandths of the map's unit along the optical axis, 0 = nothing. instances:
     16-bit PNG of id + 1, 0 = none. features: 8-bit PNG of the three main components.
-    cameras: a transforms.json in the coordinates of the map's input; None takes the map's held-out views (all views if
-    none were held out). A camera with lens distortion is rendered with that distortion, so that the image aligns with
+    cameras: a transforms.json in the coordinates of the map's input, or one of `localise`; None takes the map's held-out
+    views (all views if none were held out). A camera with lens distortion is rendered with that distortion, so that the image aligns with
     its photo. InputError for a name that points outside `output`, and for an image
     that would replace a photo.
     """
@@ -51,8 +51,9 @@ def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[st
     if cameras is None:
         views = map_views(gmap)
     else:
-        placed = map_from_input(map_path, gmap.info)
-        views = [moved(view, placed) for view in _cameras(cameras)]
+        views = _cameras(cameras)
+        if not in_map_frame(cameras):
+            views = [moved(view, map_from_input(map_path, gmap.info)) for view in views]
     files = _picture_names([safe_name(view.name, cameras or map_path) for view in views])  # no path outside `output`
     folders = {kind: output if len(what) == 1 else output / kind for kind in what}
     refuse_inputs((folder / file for folder in folders.values() for file in files), [map_path, *_listed(cameras)])
@@ -76,12 +77,6 @@ def _listed(cameras: Path | None) -> list[Path]:
         return []
     photos = [cameras.parent / name for name, _, _ in read_frames(cameras)]
     return [cameras, *photos, *(photo.with_name(f"{photo.name}.png") for photo in photos)]
-
-
-def as_gaussians(gmap: Map) -> Gaussians:
-    """A map's Gaussians as tensors."""
-    names = ("means", "quats", "log_scales", "opacity_logits", "sh", "features")
-    return Gaussians(**{name: torch.from_numpy(np.ascontiguousarray(getattr(gmap, name))) for name in names})
 
 
 def rendered_crop(gmap: QueryMap, instance_id: int, side: int) -> np.ndarray | None:
@@ -139,11 +134,11 @@ def _picture(kind: str, gaussians: Gaussians, gmap: Map, view: View) -> np.ndarr
     if kind == "depth":
         depth = depth_image(gaussians, pose, K, view.width, view.height)
         return (depth * 1000).round().clamp(0, 65535).numpy().astype(np.uint16)
-    features = gaussians.features if kind == "features" else None
-    out = render(gaussians, pose, K, view.width, view.height, harmonics=True, features=features)
-    if out.features is not None:
-        return features_to_rgb(out.features[0].numpy())
-    return (out.colors[0].clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
+    if kind == "rgb":
+        return rgb_image(gaussians, pose, K, view.width, view.height)
+    out = render(gaussians, pose, K, view.width, view.height, features=gaussians.features)
+    assert out.features is not None  # for the type checker
+    return features_to_rgb(out.features[0].numpy())
 
 
 def write_picture(path: Path, image: np.ndarray) -> None:

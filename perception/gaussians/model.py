@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from perception.colors import rgb_from_sh, sh_from_rgb
+from perception.map.map import Map
 from perception.rasterizer.types import Inputs
 
 
@@ -112,6 +113,11 @@ class Gaussians:
             features=features,
             background=None if background is None else background.to(device),
         )
+
+
+def as_gaussians(gmap: Map) -> Gaussians:
+    """A map's Gaussians as tensors."""
+    return Gaussians(**{name: torch.from_numpy(np.ascontiguousarray(getattr(gmap, name))) for name in STORED.values()})
 
 
 def from_points(

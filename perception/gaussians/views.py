@@ -148,6 +148,15 @@ def _render(gaussians: Gaussians, view: TrainingView) -> Forward:
 
 
 @torch.no_grad()
+def rgb_image(
+    gaussians: Gaussians, camera_from_world: torch.Tensor, K: torch.Tensor, width: int, height: int
+) -> np.ndarray:
+    """The Gaussians' picture [H, W, 3] uint8."""
+    out = render(gaussians, camera_from_world, K, width, height, harmonics=True, depth=False)
+    return (out.colors[0].clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
+
+
+@torch.no_grad()
 def depth_image(
     gaussians: Gaussians, camera_from_world: torch.Tensor, K: torch.Tensor, width: int, height: int
 ) -> torch.Tensor:

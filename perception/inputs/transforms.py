@@ -17,7 +17,7 @@ from perception.inputs.start_cloud import start_points
 from perception.io.documents import brief, read_json, safe_name
 from perception.photos.decode import SUFFIXES, photo_size, why_left_out
 from perception.photos.ignore_masks import mask_of
-from perception.photos.lens import FISHEYE, PERSPECTIVE, opencv_lens
+from perception.photos.lens import FISHEYE, PERSPECTIVE, camera_from_lens, opencv_lens
 from perception.photos.view_json import absolute
 from perception.photos.views import fit_lens, make_view, rigid_pose
 from perception.sfm.options import NO_CLOUD, ReadOptions
@@ -74,6 +74,24 @@ def read_frames(file: Path) -> list[tuple[str, np.ndarray, Lens]]:
     """(file_path, camera_from_world [4, 4], lens) of every frame, in file order; with w, h photos need not exist."""
     data = _load(file)
     return [(str(f["file_path"]), _pose(file, f), _lens(file, {**data, **f}, None)) for f in data["frames"]]
+
+
+def in_map_frame(file: Path) -> bool:
+    """Whether its poses are in the frame of a map, as `perception localise` writes them, not in that of an input."""
+    data = read_json(file)
+    return isinstance(data, dict) and "map_id" in data
+
+
+def lens_values(lens: Lens) -> dict[str, Any]:
+    """The keys of a lens in transforms.json, as this file reads them. InputError for a model that has none there."""
+    names = {"f": ("fl_x", "fl_y"), "fx": ("fl_x",), "fy": ("fl_y",), "k": ("k1",)}
+    fisheye = "FISHEYE" in lens.model
+    values: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV"}
+    for name, value in zip(camera_from_lens(lens).params_info.split(", "), lens.params, strict=True):
+        values.update(dict.fromkeys(names.get(name, (name,)), value))
+    if values.keys() - {"camera_model", "fl_x", "fl_y", "cx", "cy", *(FISHEYE if fisheye else PERSPECTIVE)}:
+        raise InputError(f"camera model {lens.model} cannot be written to a transforms.json; undistort the photos")
+    return {**values, "w": lens.width, "h": lens.height}
 
 
 def listed_photos(file: Path) -> tuple[list[Path], bool]:

@@ -18,7 +18,7 @@ import torch
 from perception.colors import instance_palette
 from perception.config import flat
 from perception.errors import InputError
-from perception.export.render import as_gaussians
+from perception.gaussians.model import as_gaussians
 from perception.gaussians.views import TrainingView, render, render_view
 from perception.instances.crops import expand_box, mask_box
 from perception.instances.silhouettes import render_silhouettes

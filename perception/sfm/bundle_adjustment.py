@@ -75,18 +75,22 @@ def residuals(tracks: Tracks, poses: Poses, points: np.ndarray) -> tuple[np.ndar
     return error, np.where(known, x[:, 2] / np.where(known, tracks.depth, 1.0) - 1.0, 0.0), x
 
 
-def adjust(tracks: Tracks, given: Poses, poses: Poses, prior: tuple[float, float]) -> Poses:
+def adjust(
+    tracks: Tracks, given: Poses, poses: Poses, prior: tuple[float, float], held: np.ndarray | None = None
+) -> Adjusted:
     """`poses` adjusted, together with the points of the tracks. given: the poses that the priors pull to.
     prior: standard errors of a given pose relative to that of the next view: angle in radians, centre in scene units.
-    The priors keep the world frame, and hold views that have no features."""
+    The priors keep the world frame, and hold views that have no features. held [N]: mask of poses that stay as given.
+    """
     points, priors = starting_points(tracks, poses), _priors(len(given.center), prior)
+    held = np.zeros(len(given.center), bool) if held is None else held
     for _ in range(ROUNDS):
         error, depth, _ = residuals(tracks, poses, points)
         known = np.abs(depth[tracks.depth > 0])
         # Standard errors from the medians of normal residuals in 2D (1.18 σ) and 1D (0.67 σ).
         sigma = max(float(np.median(np.hypot(*error.T))) / 1.1774, LEAST_PIXELS)
         depth_sigma = max(float(np.median(known)) / 0.6745 if len(known) else 0.0, LEAST_DEPTH)
-        problem = _Problem(tracks, given, *priors, sigma, depth_sigma)
+        problem = _Problem(tracks, given, *priors, sigma, depth_sigma, held)
         damping, cost = 1e-4, _cost(problem, poses, points)
         for _ in range(STEPS):
             delta, shift = _step(problem, poses, points, damping)
@@ -98,13 +102,13 @@ def adjust(tracks: Tracks, given: Poses, poses: Poses, prior: tuple[float, float
             poses, points, damping, gain, cost = moved, shifted, max(damping / 10, 1e-9), 1 - now / cost, now
             if gain < GAIN:
                 break
-    return poses
+    return Adjusted(poses, points, problem)
 
 
 @dataclass(frozen=True)
 class _Problem:
     """prior_rows, prior_weights: see `_priors`. sigma: standard error of features in pixels; depth_sigma: of measured
-    depth relative to it."""
+    depth relative to it. held [N]: mask of poses that are not adjusted."""
 
     tracks: Tracks
     given: Poses
@@ -112,6 +116,25 @@ class _Problem:
     prior_weights: np.ndarray
     sigma: float
     depth_sigma: float
+    held: np.ndarray
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """What `adjust` found: poses, and points [P, 3]."""
+
+    poses: Poses
+    points: np.ndarray
+    _problem: _Problem
+
+    def covariances(self) -> np.ndarray:
+        """[K, 6, 6] of the K poses that are not held, each as `Poses.turned` takes its change; of points as well as
+        poses: the blocks of the inverse of the reduced normal matrix (Triggs et al. 2000, section 6.1)."""
+        free = np.flatnonzero(~self._problem.held)
+        rows = (6 * free[:, None] + np.arange(6)).ravel()
+        reduced = _normal(self._problem, self.poses, self.points, 0.0)[0]
+        inverse = np.linalg.inv(reduced[rows][:, rows].toarray()).reshape(len(free), 6, len(free), 6)
+        return np.asarray(inverse[np.arange(len(free)), :, np.arange(len(free))])
 
 
 def _normalised(problem: _Problem, poses: Poses, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -141,6 +164,16 @@ def _priors(count: int, prior: tuple[float, float]) -> tuple[Any, np.ndarray]:
 
 def _step(problem: _Problem, poses: Poses, points: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
     """One damped step: delta [N, 6] of the poses, shift [P, 3] of the points."""
+    reduced, right, V_inverse, g_point, W = _normal(problem, poses, points, damping)
+    reduced.setdiag(reduced.diagonal() * (1 + damping))
+    delta = _solved(reduced, right)
+    shift = np.einsum("pij,pj->pi", V_inverse, g_point - (W.T @ delta).reshape(-1, 3))
+    return delta.reshape(-1, 6), shift
+
+
+def _normal(problem: _Problem, poses: Poses, points: np.ndarray, damping: float) -> tuple[Any, ...]:
+    """The normal equations with the points eliminated: matrix [6N, 6N] sparse, right side [6N]; for the points: inverse
+    of their blocks [P, 3, 3], right side [P, 3], coupling [6N, 3P]."""
     from scipy.sparse import bsr_matrix, diags
 
     tracks, count, size = problem.tracks, len(poses.center), problem.tracks.size
@@ -161,10 +194,7 @@ def _step(problem: _Problem, poses: Poses, points: np.ndarray, damping: float) -
     prior_g = -(A.T @ (weight * (A @ poses.since(problem.given).ravel())))
     U = bsr_matrix((U, np.arange(count), np.arange(count + 1)), shape=(6 * count, 6 * count))
     reduced = (U + A.T @ diags(weight) @ A - eliminate @ W.T).tocsr()
-    reduced.setdiag(reduced.diagonal() * (1 + damping))
-    delta = _solved(reduced, g_pose.ravel() + prior_g - eliminate @ g_point.ravel())
-    shift = np.einsum("pij,pj->pi", V_inverse, g_point - (W.T @ delta).reshape(size, 3))
-    return delta.reshape(count, 6), shift
+    return reduced, g_pose.ravel() + prior_g - eliminate @ g_point.ravel(), V_inverse, g_point, W
 
 
 def _linearised(problem: _Problem, poses: Poses, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -185,6 +215,7 @@ def _linearised(problem: _Problem, poses: Poses, points: np.ndarray) -> tuple[np
     arm = points[tracks.point] - poses.center[tracks.view]
     # x_camera = R Exp(θ)ᵀ (p − c − δ):  ∂/∂θ = R [p − c]×,  ∂/∂δ = −R.
     J_pose = np.concatenate([np.cross(J_point, arm[:, None]), -J_point], axis=2)
+    J_pose[problem.held[tracks.view]] = 0
     residual = np.concatenate([np.where(front[:, None], error, 0.0), depth[:, None]], axis=1)
     return root * residual, J_pose, J_point
 

@@ -84,6 +84,11 @@ def similar_photos(descriptors: list[np.ndarray]) -> np.ndarray:
 
 
 def _largest_features(database: Path, names: list[str]) -> list[np.ndarray]:
+    return [unit(data[by_size[:COARSE_FEATURES]]) for _, data, by_size in stored_features(database, names)]
+
+
+def stored_features(database: Path, names: list[str]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Of each photo's features: pixels [F, 2], descriptors [F, 128] uint8, and their order by size, largest first."""
     pycolmap = load_pycolmap()
     result = []
     with pycolmap.Database.open(database) as db:
@@ -91,12 +96,16 @@ def _largest_features(database: Path, names: list[str]) -> list[np.ndarray]:
             image = db.read_image_with_name(name)
             keypoints = db.read_keypoints(image.image_id)
             keypoints = keypoints if isinstance(keypoints, np.ndarray) else pycolmap.keypoints_to_matrix(keypoints)
-            data = np.asarray(db.read_descriptors(image.image_id).data, dtype=np.float32)
             area = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
-            top = np.argsort(-area, kind="stable")[:COARSE_FEATURES]
-            norms = np.linalg.norm(data[top], axis=1, keepdims=True)
-            result.append(data[top] / np.maximum(norms, 1e-9))
+            data = np.asarray(db.read_descriptors(image.image_id).data)
+            result.append((keypoints[:, :2].astype(np.float64), data, np.argsort(-area, kind="stable")))
     return result
+
+
+def unit(descriptors: np.ndarray) -> np.ndarray:
+    """Descriptors [F, 128] as float32 of unit length."""
+    data = descriptors.astype(np.float32)
+    return np.asarray(data / np.maximum(np.linalg.norm(data, axis=1, keepdims=True), 1e-9))
 
 
 def coarse_votes(descriptors: list[np.ndarray], compared: np.ndarray, progress: Progress) -> sparse.csr_matrix:
@@ -110,7 +119,7 @@ def coarse_votes(descriptors: list[np.ndarray], compared: np.ndarray, progress: 
             others = [descriptors[j] for j in chosen]
             similarity = descriptors[i] @ np.concatenate(others).T
             blocks = np.split(similarity, np.cumsum([len(other) for other in others])[:-1], axis=1)
-            found += [_mutual_matches(block) for block in blocks]
+            found += [len(mutual_matches(block)) for block in blocks]
         votes = np.array(found, np.int64)
         more = votes > 0
         return sparse.csr_matrix((votes[more], (np.zeros(more.sum(), int), later[more])), shape=(1, count))
@@ -126,14 +135,15 @@ def coarse_votes(descriptors: list[np.ndarray], compared: np.ndarray, progress: 
     return votes
 
 
-def _mutual_matches(similarity: np.ndarray) -> int:
-    """Number of mutual nearest neighbours that pass Lowe's ratio test; [F, G] dot products of unit descriptors.
+def mutual_matches(similarity: np.ndarray, ratio: float = COARSE_RATIO) -> np.ndarray:
+    """[M, 2] mutual nearest neighbours that pass Lowe's ratio test; [F, G] dot products of unit descriptors.
     The largest value of each row is overwritten."""
     if min(similarity.shape) < 2:
-        return 0
+        return np.empty((0, 2), np.int64)
     rows = np.arange(len(similarity))
     best = similarity.argmax(1)
     mutual = similarity.argmax(0)[best] == rows
     first = similarity[rows, best]
     similarity[rows, best] = -1
-    return int((mutual & (1 - first <= COARSE_RATIO**2 * (1 - similarity.max(1)))).sum())
+    good = mutual & (1 - first <= ratio**2 * (1 - similarity.max(1)))
+    return np.stack([rows[good], best[good]], axis=1)

@@ -88,14 +88,14 @@ def refine(features: Features, given: Poses) -> Poses:
     """Poses that agree with the matches and the measured depth, in the world frame of the given ones."""
     poses = given
     for _ in range(ROUNDS):
-        tracks = tracks_of(features, features.pairs[_agreeing(features, poses)])
+        tracks = tracks_of(features, features.pairs[agreeing(features, poses)])
         if poses is given:
             angle = max(_medians(features, given).values()) / float(np.median(features.focal))
             depth = residuals(tracks, poses, starting_points(tracks, poses))[2][:, 2]
             if not (depth > 0).any():
                 return given
             prior = angle, angle * float(np.median(depth[depth > 0]))
-        poses = adjust(tracks, given, poses, prior)
+        poses = adjust(tracks, given, poses, prior).poses
     return moved_back(poses, given, prior[1] / prior[0])
 
 
@@ -114,7 +114,7 @@ def moved_back(poses: Poses, given: Poses, distance: float) -> Poses:
     return Poses(np.einsum("nij,kj->nik", poses.rotation, turn), center)
 
 
-def _agreeing(features: Features, poses: Poses) -> np.ndarray:
+def agreeing(features: Features, poses: Poses) -> np.ndarray:
     """Mask [M] of the matches whose errors are at most GATE times the median."""
     good = np.ones(2 * len(features.pairs), bool)
     for errors in match_errors(features, poses):
@@ -125,7 +125,7 @@ def _agreeing(features: Features, poses: Poses) -> np.ndarray:
 
 def _depth_unit(features: Features, poses: Poses) -> float:
     """Median ratio of triangulated to measured depth; 1 without depth."""
-    tracks = tracks_of(features, features.pairs[_agreeing(replace(features, depth=0 * features.depth), poses)])
+    tracks = tracks_of(features, features.pairs[agreeing(replace(features, depth=0 * features.depth), poses)])
     blind = replace(tracks, depth=0 * tracks.depth)
     along = residuals(blind, poses, starting_points(blind, poses))[2][:, 2]
     known = (tracks.depth > 0) & (along > 0)

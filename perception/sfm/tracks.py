@@ -80,7 +80,19 @@ def _measured(view: View, keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def tracks_of(features: Features, pairs: np.ndarray) -> Tracks:
-    """Connected components of the matches `pairs`; a view in which one has two features is left out of it."""
+    """The tracks of the matches `pairs`, as `grouped` finds them."""
+    return observed(features, *grouped(features, pairs))
+
+
+def observed(features: Features, rows: np.ndarray, point: np.ndarray) -> Tracks:
+    """The features `rows` [O] as observations of `point` [O], which ascends."""
+    values = (getattr(features, name)[rows] for name in ("rays", "focal", "depth"))
+    return Tracks(features.view[rows], point, *values)
+
+
+def grouped(features: Features, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Connected components of the matches `pairs`: features [O] and the component [O] of each, which ascends from 0.
+    A view in which a component has two features is left out of it."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -92,8 +104,7 @@ def tracks_of(features: Features, pairs: np.ndarray) -> Tracks:
     single &= np.bincount(component, single)[component] >= 2
     kept = np.flatnonzero(single)
     kept = kept[np.argsort(component[kept], kind="stable")]
-    point = np.unique(component[kept], return_inverse=True)[1]
-    return Tracks(view[kept], point, features.rays[kept], features.focal[kept], features.depth[kept])
+    return kept, np.unique(component[kept], return_inverse=True)[1]
 
 
 def tracks_of_model(model: Any, views: list[View], names: dict[int, str], most: int = MOST_POINTS) -> Tracks:

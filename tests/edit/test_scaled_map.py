@@ -11,8 +11,8 @@ import torch
 
 from perception.cli import main
 from perception.edit.scale import scaled
-from perception.export.render import as_gaussians
 from perception.frame.recentre import map_from_input
+from perception.gaussians.model import as_gaussians
 from perception.gaussians.views import render
 from perception.map.write import Map, read_map, write_map
 from support.viewer_maps import small_map

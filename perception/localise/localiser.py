@@ -1,0 +1,267 @@
+"""`Localiser`: poses of new photos in the frame of a map, from features and, where there is some, measured depth.
+
+A photo alone: the map's photos that look most like it, matches of their features, pose by RANSAC and checks
+(`pose.find_pose`). Then all new photos together with the map's cameras held (`joint.adjusted`); a photo that only
+overlaps other new photos is reached through them.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.localise.joint import Adjustment, adjusted, contradicted
+from perception.localise.keypoints import described, tolerance
+from perception.localise.pose import MIN_INLIERS, Matched, find_pose
+from perception.localise.reference import Locate, Reference, open_reference
+from perception.map.map import Map
+from perception.photos.decode import photo_size, why_left_out
+from perception.photos.lens import camera_from_lens, load_pycolmap, rescale_lens, same_aspect
+from perception.photos.views import make_view, view_lens
+from perception.progress import QUIET, Progress
+from perception.sfm.database import build_features
+from perception.sfm.options import ReadOptions
+from perception.sfm.tracks import features_of
+from perception.types import DepthImage, Lens, View
+
+LIKELY, MORE = 10, 60
+"""Photos of the map that a new photo is matched with: the most alike, and if they give no pose, so many more."""
+SAME_FOCAL = 0.15
+"""Largest relative difference of a photo's focal length in EXIF from that of the map's camera of the same size, for the
+map's camera to be taken: EXIF states nominal values."""
+OTHER_UNIT = 1.5
+"""Measured depth is scaled if it differs from that of the map's points by this factor: it has another unit."""
+
+
+@dataclass(frozen=True)
+class NewPhoto:
+    """A photo to be localised. lens: None if not known. depth: scale in the map's unit."""
+
+    name: str
+    photo: Path
+    lens: Lens | None = None
+    depth: DepthImage | None = None
+
+
+@dataclass(frozen=True)
+class Localised:
+    """A photo's pose: camera_from_map [4, 4] float64, OpenCV axes, in the map's frame and unit. lens: known, or as
+    estimated. covariance [6, 6]: of the rotation vector about the map's axes (radians), then of the position. inliers:
+    features that agree with the pose; rms_px: their error in pixels."""
+
+    name: str
+    photo: Path
+    lens: Lens
+    camera_from_map: np.ndarray
+    covariance: np.ndarray
+    inliers: int
+    rms_px: float
+
+    @property
+    def position(self) -> np.ndarray:
+        """[3] of the camera in the map's frame."""
+        return np.asarray(-self.camera_from_map[:3, :3].T @ self.camera_from_map[:3, 3])
+
+    @property
+    def standard_error(self) -> tuple[float, float]:
+        """Of the position in the map's unit, and of the direction in degrees: roots of the sums of the variances."""
+        turn, shift = np.trace(self.covariance[:3, :3]), np.trace(self.covariance[3:, 3:])
+        return float(np.sqrt(shift)), float(np.degrees(np.sqrt(turn)))
+
+
+@dataclass(frozen=True)
+class NotHere:
+    """A photo without a pose, and why, one line."""
+
+    name: str
+    photo: Path
+    why: str
+
+
+class Localiser:
+    """Holds the features of a map's photos in memory; each call then takes well under a second for a photo.
+
+    photos: a folder where the map's photos are looked for beside where the map records them. locate: another rule for
+    that (see `reference.Locate`). Pictures that are not at hand are rendered from the map; `rendered` names them. The
+    same photos in one call give the same poses, bit for bit.
+    """
+
+    def __init__(
+        self, gmap: Map, photos: Path | None = None, progress: Progress = QUIET, locate: Locate | None = None
+    ) -> None:
+        self._progress = progress
+        self._reference = open_reference(gmap, locate or _finder(gmap, photos), progress)
+
+    @property
+    def rendered(self) -> list[str]:
+        """Names of the map's views whose photos were not at hand."""
+        return self._reference.rendered
+
+    def localise(
+        self,
+        photos: Sequence[Path],
+        lens: Lens | Sequence[Lens | None] | None = None,
+        depths: Sequence[DepthImage | None] | None = None,
+    ) -> list[Localised | None]:
+        """The pose of each photo; None for one that is not in the map. lens: of all photos, or of each; depths: of each
+        (scale in the map's unit). InputError for a photo that cannot be read."""
+        for photo in photos:
+            why_left_out(photo, strict=True)
+        lenses = [lens] * len(photos) if lens is None or isinstance(lens, Lens) else lens
+        each = zip(photos, lenses, depths or [None] * len(photos), strict=True)
+        found = self.answers([NewPhoto(photo.name, photo, own, depth) for photo, own, depth in each])
+        return [answer if isinstance(answer, Localised) else None for answer in found]
+
+    def answers(self, photos: Sequence[NewPhoto]) -> list[Localised | NotHere]:
+        """As `localise`, with the reason for each photo that has no pose; one that cannot be read is among these."""
+        unread = {n: why for n, p in enumerate(photos) if (why := why_left_out(p.photo)) is not None}
+        usable = [n for n in range(len(photos)) if n not in unread]
+        found = _Search(self._reference, [photos[n] for n in usable], self._progress).run() if usable else []
+        done = dict(zip(usable, found, strict=True))
+        return [done[n] if n in done else NotHere(p.name, p.photo, unread[n]) for n, p in enumerate(photos)]
+
+
+class _Search:
+    """One call: some photos, all readable."""
+
+    def __init__(self, reference: Reference, photos: list[NewPhoto], progress: Progress) -> None:
+        self.reference, self.photos, self.progress = reference, photos, progress
+        lenses = [_lens_of(photo, reference.views) for photo in photos]
+        with TemporaryDirectory(prefix="perception-localise-") as folder:
+            options = ReadOptions(Path(folder), progress=progress)
+            paths = [photo.photo for photo in photos]
+            self.store = build_features(paths, [lens for lens, _ in lenses], options)
+            self.views = [_view(photo, lens) for photo, (lens, _) in zip(photos, lenses, strict=True)]
+            self.new = described(features_of(self.views, self.store), self.store)
+        self.known = [known for _, known in lenses]
+        self.most = tolerance(max(max(view.photo_size) for view in self.views))
+        self.placed: dict[int, np.ndarray] = {}
+        self.links: dict[int, np.ndarray] = {}
+        self.why: dict[int, str] = {}
+        self.dropped = Counter[int]()
+
+    def run(self) -> list[Localised | NotHere]:
+        candidates = {}
+        for number in range(len(self.photos)):
+            candidates[number] = self._alone(number)
+            self.progress.update("localise: photos", number + 1, len(self.photos))
+        found = None
+        while self.placed:
+            found = adjusted(self.reference, self.new, self.placed, self._all_links(), self.most)
+            self._take(found)
+            wrong = contradicted(self.reference, self.new, found, set(self.placed), self.most)
+            if wrong is not None:
+                self._drop(wrong, "its matches with the other new photos contradict its pose")
+            elif not self._reach(found, candidates):
+                break
+        return [self._answer(number, found) for number in range(len(self.photos))]
+
+    def _alone(self, number: int) -> np.ndarray:
+        """Places a photo by the map's photos alone; its matches [M, 2] with features of the map that have a point."""
+        reference = self.reference
+        order = np.argsort(-self.new.votes(number, reference.described), kind="stable")
+        matches = np.empty((0, 2), np.int64)
+        for some in (order[:LIKELY], order[LIKELY : LIKELY + MORE]):
+            more = [self.new.matches(number, reference.described, view) for view in some.tolist()]
+            matches = np.concatenate([matches, *more])
+            matches = matches[reference.point[matches[:, 1]] >= 0]
+            self._try(number, matches, reference.points[reference.point[matches[:, 1]]])
+            if number in self.placed:
+                break
+        return matches
+
+    def _try(self, number: int, matches: np.ndarray, points: np.ndarray, others: int = 0) -> None:
+        """Places a photo by matches [M, 2] with points [M, 3]; the last `others` are of other new photos."""
+        matched = Matched(matches[:, 0], self.new.pixels[matches[:, 0]], points)
+        found = find_pose(matched, view_lens(self.views[number]), self.known[number])
+        if isinstance(found, str):
+            self.why[number] = found
+            return
+        self.placed[number] = found.camera_from_map
+        mine = matches[: len(matches) - others]
+        self.links[number] = mine[found.inliers[: len(mine)]]
+
+    def _reach(self, found: Adjustment, candidates: dict[int, np.ndarray]) -> bool:
+        """Tries the photos without a pose again, with the points of the new photos as well; whether one was placed.
+        A photo that lost its pose twice is not tried again."""
+        before, pairs = set(self.placed), self.new.features.pairs
+        both = np.concatenate([pairs, pairs[:, ::-1]])
+        both = both[found.point[both[:, 1]] >= 0]
+        for number in sorted(set(range(len(self.photos))) - before):
+            through = both[self.new.features.view[both[:, 0]] == number]
+            if not len(through) or self.dropped[number] >= 2:
+                continue
+            own = candidates[number]
+            points = [self.reference.points[self.reference.point[own[:, 1]]], found.points[found.point[through[:, 1]]]]
+            self._try(number, np.concatenate([own, through]), np.concatenate(points), others=len(through))
+        return len(self.placed) > len(before)
+
+    def _take(self, found: Adjustment) -> None:
+        """Takes over refined poses; photos that kept too few features lose theirs."""
+        count = len(self.reference.views)
+        for number in list(self.placed):
+            if found.inliers.get(number, 0) < MIN_INLIERS:
+                self._drop(number, f"{found.inliers.get(number, 0)} features agree with its refined pose")
+                continue
+            self.placed[number] = np.eye(4)
+            self.placed[number][:3, :3] = found.poses.rotation[count + number]
+            self.placed[number][:3, 3] = -found.poses.rotation[count + number] @ found.poses.center[count + number]
+
+    def _drop(self, number: int, why: str) -> None:
+        del self.placed[number], self.links[number]
+        self.dropped[number] += 1
+        self.why[number] = why
+
+    def _all_links(self) -> np.ndarray:
+        return np.concatenate([np.empty((0, 2), np.int64), *(self.links[n] for n in sorted(self.links))])
+
+    def _answer(self, number: int, found: Adjustment | None) -> Localised | NotHere:
+        photo = self.photos[number]
+        if number not in self.placed or found is None:
+            return NotHere(photo.name, photo.photo, f"not in this map: {self.why[number]}")
+        lens, pose = view_lens(self.views[number]), self.placed[number]
+        figures = found.covariance[number], found.inliers[number], found.rms[number]
+        return Localised(photo.name, photo.photo, lens, pose, *figures)
+
+
+def _view(photo: NewPhoto, lens: Lens) -> View:
+    return replace(make_view(photo.name, photo.photo, lens, np.eye(4), photo.photo), depth=photo.depth)
+
+
+def _lens_of(photo: NewPhoto, views: list[View]) -> tuple[Lens, bool]:
+    """The lens of a photo, and whether it is known: given; else the map's camera of the same shape, unless EXIF states
+    another focal length; else EXIF's or a usual one."""
+    if photo.lens is not None:
+        return photo.lens, True
+    pycolmap = load_pycolmap()
+    width, height = photo_size(photo.photo)
+    exif = pycolmap.infer_camera_from_image(photo.photo)
+    stated = exif.mean_focal_length() / max(exif.width, exif.height) * max(width, height)
+    for view in views:
+        lens = view_lens(view)
+        if same_aspect((width, height), (lens.width, lens.height)):
+            lens = rescale_lens(lens, width, height)
+            focal = camera_from_lens(lens).mean_focal_length()
+            if not exif.has_prior_focal_length or abs(stated / focal - 1) <= SAME_FOCAL:
+                return lens, False
+    return Lens("SIMPLE_PINHOLE", (stated, width / 2, height / 2), width, height), False
+
+
+def _finder(gmap: Map, folder: Path | None) -> Locate:
+    """Photos where the map records them, else in `folder` by the view's name, of the recorded size."""
+
+    def locate(view: View) -> View:
+        try:
+            return gmap.with_photo(view)
+        except InputError:
+            if folder is None:
+                raise
+            return gmap.with_photo(replace(view, photo=folder / view.name, photo_beside=None))  # type: ignore[call-arg]
+
+    return locate
