@@ -13,17 +13,16 @@ from perception.gaussians.depth_start import start_on_surface
 from perception.gaussians.model import Gaussians
 from perception.gaussians.state import TrainRecord, sized
 from perception.gaussians.train import Trainer
-from perception.gaussians.views import TrainingView
 from perception.instances.assign import LEAST_AGREEMENT, affinities, mask_shares
 from perception.instances.group import Grouping, group
 from perception.instances.votes import MaskVotes
 from perception.pipeline.checkpoint import TrainingObserver
-from perception.pipeline.optimise import Run
+from perception.pipeline.optimise import Photos, Run
 from perception.visits.evidence import AGREE, LEAST_PIXELS, WEIGHTS
 from perception.visits.look import Look, correlation
 
-SHARE = 0.25
-"""Iterations of an update, relative to those of a new map of as many photos."""
+GROWING, SETTLING = 0.16, 0.1
+"""Iterations of the two legs of an update, relative to those of a new map of as many photos."""
 LEAST_ITERATIONS = 100
 SHIFTED = 0.01
 """Relative difference of depth from which a pixel of a mask that the map does not explain shows a new surface."""
@@ -75,21 +74,13 @@ def update_config(config: MapConfig, photos: int, share: float, start: int) -> M
 
 
 def trained(
-    run: Run,
-    leg: str,
-    mark: str,
-    masks: str,
-    gaussians: Gaussians,
-    held: int,
-    views: list[TrainingView],
-    held_out: list[TrainingView],
-    config: MapConfig,
+    run: Run, leg: str, mark: str, masks: str, gaussians: Gaussians, held: int, photos: Photos, config: MapConfig
 ) -> tuple[Gaussians, TrainRecord]:
-    """Trains one leg from its checkpoint on, if there is one: all of the Gaussians beyond the first `held` rows, and the
-    colours of those."""
+    """Trains one leg, from its checkpoint on if there is one: all of the Gaussians beyond the first `held` rows, and the
+    colours of those. On the CPU."""
     work = run.work / f"leg-{leg}"
     work.mkdir(exist_ok=True)
-    trainer = Trainer(gaussians, views, config, held_out, run.device, held=held)
+    trainer = Trainer(gaussians, photos.views, config, photos.held, run.device, held=held)
     trainer.stopping.degree_decided = True  # the map's
     observer = TrainingObserver(work, mark, masks, 0.0, run.progress)
     observer.take_up(trainer)

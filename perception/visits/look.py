@@ -56,7 +56,9 @@ def compared(view: TrainingView) -> TrainingView:
     return view.halved() if max(view.photo.shape[:2]) >= HALVED_FROM else view
 
 
-def stereo_of(gaussians: Gaussians, views: Sequence[View], photos: Sequence[TrainingView], progress: Progress = QUIET) -> list[StereoView | None]:
+def stereo_of(
+    gaussians: Gaussians, views: Sequence[View], photos: Sequence[TrainingView], progress: Progress = QUIET
+) -> list[StereoView | None]:
     """Depth of every photo, by a sensor or by stereo among the visit's photos; None where the map shows nothing.
 
     The map's depth only bounds the search, so that a thing that is gone is not found again.
@@ -123,9 +125,9 @@ def look(gaussians: Gaussians, ids: np.ndarray, view: TrainingView, measured: np
     mapped = expected_depth(out).numpy()
     image = view.exposed(out.colors[0]).clamp(0, 1).numpy()
     photo = view.photo.numpy().astype(np.float32) / 255
-    silhouettes = render_silhouettes(
-        gaussians, [ids], view.camera_from_world, view.K, width, height, eps2d=view.eps2d
-    )[0]
+    silhouettes = render_silhouettes(gaussians, [ids], view.camera_from_world, view.K, width, height, eps2d=view.eps2d)[
+        0
+    ]
     shown = silhouettes.ids.copy()
     if view.weight is not None:
         shown[view.weight.numpy() == 0] = -1
