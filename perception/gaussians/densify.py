@@ -116,7 +116,8 @@ def densify(
 
 
 def decay_opacities(gaussians: Gaussians, held: int = 0) -> None:
-    """Multiplies every opacity by 1 − OPACITY_DECAY in place, but for the first `held`. Gaussians that no photo supports fade and are pruned."""
+    """Multiplies every opacity by 1 − OPACITY_DECAY in place, but for the first `held`. Gaussians
+    that no photo supports fade and are pruned."""
     gaussians.opacity_logits[held:] = _logit(gaussians.opacities * (1 - OPACITY_DECAY))[held:]
 
 

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perception.visits.look import Look, correlation
+from perception.visits.look import Look, correlation, projected
 
 AGREE = 0.03
 """Relative difference of depths up to which two are of one surface: the noise of stereo."""
 LEAST_PIXELS = 30
 """Pixels of a thing in a photo that looks at it."""
 UNSEEN = 0.12
-"""Least share of a thing's surface that a visit must see to judge it: half of what the least reliable judgement needs."""
+"""Least share of a thing's surface that a visit must see to judge it."""
 WEIGHTS = {"correlation": (14.0, 0.52), "outline": (3.0, 0.60), "colour": (-8.0, 0.12), "through": (-2.0, 0.20)}
 """Log-odds of "still there" per unit of each sign, and the value at which a sign says nothing."""
 
@@ -75,7 +75,8 @@ def signs_of(looks: Sequence[Look], things: Sequence[int], shares: np.ndarray, d
 def _in_photo(
     shown: Look, mask: np.ndarray, labels: np.ndarray, areas: np.ndarray, measured: np.ndarray, depth: float
 ) -> np.ndarray:
-    """photos, pixels, covariance, variances (2), IoU × pixels, labelled pixels, colour, measured, through, hit: sums."""
+    """The sums of 11: photos, pixels, covariance, variances (2), IoU × pixels, labelled pixels, colour, rays measured,
+    through and hit."""
     near = shown.mapped * (1 - AGREE) - depth
     mask = mask & ~(measured & (shown.measured < near))
     pixels = int(mask.sum())
@@ -109,14 +110,10 @@ def seen_rows(looks: Sequence[Look], means: np.ndarray, scales: np.ndarray) -> n
     nothing measured in front of it."""
     seen = np.zeros(len(means), bool)
     for shown in looks:
-        pose, K = (t.double().numpy() for t in (shown.view.camera_from_world, shown.view.K))
-        x, y, z = pose[:3, :3] @ means.T + pose[:3, 3:]
-        ahead = z > 1e-6
-        column, row = (
-            np.floor(K[i, i] * c / np.where(ahead, z, 1) + K[i, 2]).astype(np.int64) for i, c in ((0, x), (1, y))
-        )
+        pixel, z = projected(shown.view, means)
+        column, row = np.clip(np.floor(pixel), -1, 1 << 30).astype(np.int64).T
         height, width = shown.mapped.shape
-        inside = np.flatnonzero(ahead & (column >= 0) & (row >= 0) & (column < width) & (row < height))
+        inside = np.flatnonzero((z > 1e-6) & (column >= 0) & (row >= 0) & (column < width) & (row < height))
         mapped, measured = (image[row[inside], column[inside]] for image in (shown.mapped, shown.measured))
         limit = (1 + AGREE) * mapped + 2 * scales[inside]
         free = (measured == 0) | (measured > (1 - 2 * AGREE) * z[inside] - 2 * scales[inside])

@@ -76,8 +76,8 @@ def update_config(config: MapConfig, photos: int, share: float, start: int) -> M
 def trained(
     run: Run, leg: str, mark: str, masks: str, gaussians: Gaussians, held: int, photos: Photos, config: MapConfig
 ) -> tuple[Gaussians, TrainRecord]:
-    """Trains one leg, from its checkpoint on if there is one: all of the Gaussians beyond the first `held` rows, and the
-    colours of those. On the CPU."""
+    """Trains one leg, from its checkpoint on if there is one: all of the Gaussians beyond the first `held` rows, and
+    the colours of those. On the CPU."""
     work = run.work / f"leg-{leg}"
     work.mkdir(exist_ok=True)
     trainer = Trainer(gaussians, photos.views, config, photos.held, run.device, held=held)

@@ -148,3 +148,22 @@ def moments(image: np.ndarray, photo: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def correlation(product: float, a: float, b: float) -> float:
     """Sum of covariances over the root of the sums of variances: the correlation of brightness over all pixels."""
     return product / max(float(np.sqrt(a * b)), 1e-9)
+
+
+def in_view(means: np.ndarray, scales: np.ndarray, views: Sequence[TrainingView]) -> np.ndarray:
+    """[N] bool: Gaussians (means [N, 3], largest scales [N]) that some view may show, nothing being in front."""
+    found = np.zeros(len(means), bool)
+    for view in views:
+        pixel, z = projected(view, means)
+        reach = 3 * scales / np.maximum(z, 1e-6) * float(view.K[0, 0]) + 1
+        size = np.array(view.photo.shape[1::-1])
+        found |= (z > 0) & ((pixel > -reach[:, None]) & (pixel < size + reach[:, None])).all(axis=1)
+    return found
+
+
+def projected(view: TrainingView, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels [P, 2] and depths [P] of points [P, 3]."""
+    pose, K = view.camera_from_world.double().numpy(), view.K.double().numpy()
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    z = local[:, 2]
+    return local[:, :2] / np.where(np.abs(z) > 1e-6, z, 1e-6)[:, None] * np.diag(K)[:2] + K[:2, 2], z

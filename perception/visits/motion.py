@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from perception.gaussians.model import Gaussians
 from perception.gaussians.views import TrainingView
 from perception.geometry import nearest_rotation, rotations
 from perception.visits.evidence import Signs, signs_of
-from perception.visits.look import Look, look
+from perception.visits.look import Look, look, projected
 
 YAWS = 12
 """Starting rotations about the vertical; the 24 that map a cube's axes to each other are tried as well."""
@@ -114,12 +115,12 @@ def _starts(up: np.ndarray) -> list[np.ndarray]:
 
 
 def _icp(
-    tree: object, old: Points, new: Points, start: np.ndarray, radius: float, rounds: int
+    tree: Any, old: Points, new: Points, start: np.ndarray, radius: float, rounds: int
 ) -> tuple[float, np.ndarray]:
     pose, residual = start, np.inf
     for _ in range(rounds):
         back = (new.points - pose[:3, 3]) @ pose[:3, :3]
-        distance, nearest = tree.query(np.concatenate([back / radius, COLOUR * new.colors], axis=1))  # type: ignore[attr-defined]
+        distance, nearest = tree.query(np.concatenate([back / radius, COLOUR * new.colors], axis=1))
         kept = distance <= np.quantile(distance, TRIMMED)
         residual = float(distance[kept].mean())
         a, b = old.points[nearest[kept]], new.points[kept]
@@ -151,7 +152,8 @@ def carried(gaussians: Gaussians, new_from_old: np.ndarray) -> Gaussians:
 
 
 def turned_harmonics(sh: torch.Tensor, rotation: np.ndarray) -> torch.Tensor:
-    """Coefficients [N, K, 3] of the same colours after a rotation [3, 3]: Y(d) sh' = Y(Rᵀ d) sh for many directions d."""
+    """Coefficients [N, K, 3] of the same colours after a rotation [3, 3]: Y(d) sh' = Y(Rᵀ d) sh for
+    many directions d."""
     count = sh.shape[1]
     if count == 1:
         return sh
@@ -198,7 +200,7 @@ def cuts_of(looks: Sequence[Look], new: Gaussians, scene: Gaussians) -> list[Cut
 
 def _bounds(shown: Look, points: np.ndarray) -> tuple[int, Look, np.ndarray, np.ndarray] | None:
     """(pixels, look, corners) of the part of a photo around points [P, 3]; None where it shows less than half."""
-    pixel, z = _projected(shown, points)
+    pixel, z = projected(shown.view, points)
     size = np.array(shown.mapped.shape[::-1])
     inside = (z > 1e-3) & ((pixel >= 0) & (pixel < size)).all(axis=1)
     if inside.mean() < 0.5:
@@ -209,21 +211,13 @@ def _bounds(shown: Look, points: np.ndarray) -> tuple[int, Look, np.ndarray, np.
     return None if (high - low < 8).any() else (int((high - low).prod()), shown, low, high)
 
 
-def _projected(shown: Look, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels [P, 2] and depths [P] of points [P, 3]."""
-    pose, K = shown.view.camera_from_world.double().numpy(), shown.view.K.double().numpy()
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    z = local[:, 2]
-    return local[:, :2] / np.where(np.abs(z) > 1e-6, z, 1e-6)[:, None] * np.diag(K)[:2] + K[:2, 2], z
-
-
 def _cut(shown: Look, low: np.ndarray, high: np.ndarray, scene: Gaussians) -> Cut:
     view, part = shown.view, np.s_[low[1] : high[1], low[0] : high[0]]
     K = view.K.clone()
     K[:2, 2] -= torch.from_numpy(low.astype(np.float32))
     images = {name: getattr(view, name) for name in ("photo", "labels", "weight")}
     own = {name: image[part].contiguous() for name, image in images.items() if image is not None}
-    pixel, z = _projected(shown, scene.means.double().numpy())
+    pixel, z = projected(shown.view, scene.means.double().numpy())
     reach = 3 * scene.scales.max(dim=1).values.double().numpy() / np.maximum(z, 1e-6) * float(view.K[0, 0])
     near = (z > 0) & ((pixel + reach[:, None] > low) & (pixel - reach[:, None] < high)).all(axis=1)
     return Cut(

@@ -39,8 +39,8 @@ OTHER_UNIT = 1.5
 
 
 def update_settings(path: Path, file: Path | None, pairs: list[str]) -> MapConfig:
-    """The settings that the map at `path` was made with, but for those of its own input, overridden by the TOML file and
-    KEY=VALUE pairs. InputError for the first error, and where masks have to be given."""
+    """The settings that the map at `path` was made with, but for those of its own input, overridden by the TOML file
+    and KEY=VALUE pairs. InputError for the first error, and where masks have to be given."""
     known = dict(fields(MapConfig))
     before = dict(flat(read_info(path).get("config", {})))
     own = {key: value for key, value in before.items() if key in known and not key.startswith(OF_INPUT)}
@@ -77,7 +77,8 @@ def _localised(run: Run, gmap: Map, camera: Path | None) -> Scene:
     here = [answer for answer in answers if isinstance(answer, Localised)]
     if len(here) < LEAST_SHARE * len(answers):
         lost = next(answer for answer in answers if not isinstance(answer, Localised))
-        many = f"{len(answers) - len(here)} of {len(answers)} photos are not in {gmap.path} (first: {lost.name}: {lost.why})"
+        first = f"first: {lost.name}: {lost.why}"
+        many = f"{len(answers) - len(here)} of {len(answers)} photos are not in {gmap.path} ({first})"
         raise InputError(f"{run.source}: {many}; give photos of the mapped scene, or map this one anew")
     depths = {photo.name: photo.depth for photo in found}
     views = [

@@ -1,0 +1,196 @@
+"""What stands where today: the map's instances judged, new ones added, and those that moved recognised."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from perception.gaussians.model import Gaussians, Nearby
+from perception.gaussians.state import TrainRecord
+from perception.instances.group import Grouping
+from perception.instances.votes import mask_votes
+from perception.map.history import is_removed
+from perception.visits.evidence import Signs, seen_rows, signs_of
+from perception.visits.growth import (
+    GROWING,
+    SETTLING,
+    SPARE,
+    grouped,
+    joined_instances,
+    new_surface,
+    trained,
+    update_config,
+)
+from perception.visits.look import Look
+from perception.visits.motion import (
+    ALIKE,
+    HOPELESS,
+    Motion,
+    assigned,
+    carried,
+    cuts_of,
+    looks_alike,
+    motions_of,
+    settled,
+)
+from perception.visits.visit import Visit, gaussians_of
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass
+class Today:
+    """What stands where today: the Gaussians, of which the first rows are the rows `kept` [H] of the map; ids
+    [N] int32 instance, `membership` [N], part_ids [N]; signs of the map's instances, in their order; `gone`: ids of
+    those that do not stand where they stood; motions by id; `added`: scores of the new ones, by id."""
+
+    gaussians: Gaussians
+    kept: np.ndarray
+    ids: np.ndarray
+    membership: np.ndarray
+    part_ids: np.ndarray
+    signs: list[Signs]
+    gone: list[int]
+    motions: dict[int, Motion]
+    added: dict[int, float]
+    record: TrainRecord
+
+
+def seen_today(visit: Visit) -> Today:
+    """Judges the map's instances, adds what is new, and finds out what moved."""
+    gmap, run, progress = visit.gmap, visit.run, visit.run.progress
+    with run.stage("evidence"):
+        signs = _signs(visit)
+    entries = gmap.instances
+    gone = [e["id"] for e, s in zip(entries, signs, strict=True) if not is_removed(e) and s.seen and s.log_odds < 0]
+    stays = np.flatnonzero(~np.isin(visit.ids, gone))
+    held, ids, kept = visit.gaussians.rows(torch.from_numpy(stays)), visit.ids[stays], visit.rows[stays]
+    with run.stage("look"):
+        looks = visit.looks(held, ids)
+    new = new_surface(looks, held, run.config.train.budget or len(visit.gaussians), run.config.seed)
+    progress.log(f"{len(gone)} things do not stand where they stood; {len(new)} points of new surface")
+    config = update_config(run.config, len(visit.photos.views), GROWING, len(held) + SPARE * len(new))
+    together = Gaussians.concatenate([held, new])
+    grown, record = trained(run, "grow", visit.mark, visit.masks["identity"], together, len(held), visit.photos, config)
+
+    with run.stage("instances"):
+        rows = np.arange(len(held), len(grown))
+        votes = mask_votes(Nearby(grown), visit.photos.views, half_resolution=run.config.losses.half_resolution)
+        ids = np.concatenate([ids, np.full(len(rows), -1, np.int32)])
+        known, number = np.unique(ids[ids >= 0], return_inverse=True)
+        dense = np.full(len(ids), -1, np.int32)
+        dense[ids >= 0] = number
+        joined = joined_instances(votes, dense, rows)
+        ids[rows] = np.append(known, -1)[joined]
+        free = rows[joined < 0]
+        made = grouped(grown, votes, free, run.config)
+    things = [(free[made.ids == n], float(made.scores[n])) for n in range(made.count)]
+    with run.stage("motion"):
+        looks = visit.looks(grown, ids)
+        pairs = _moved(visit, grown, things, gone, looks)
+    return _settled(visit, grown, kept, ids, made, free, signs, gone, things, pairs, record)
+
+
+def _signs(visit: Visit) -> list[Signs]:
+    gmap, entries = visit.gmap, visit.gmap.instances
+    looks = visit.looks(visit.gaussians, gmap.instance_ids)
+    seen = seen_rows(looks, gmap.means.astype(np.float64), gmap.scales.max(axis=1))
+    ids = [entry["id"] for entry in entries]
+    order = np.argsort(ids)
+    position = (
+        order[np.clip(np.searchsorted(np.array(ids)[order], gmap.instance_ids), 0, len(ids) - 1)] if ids else None
+    )
+    shares = np.zeros(len(ids))
+    if position is not None:
+        owned = gmap.instance_ids >= 0
+        total = np.bincount(position[owned], minlength=len(ids))
+        shares = np.bincount(position[owned & seen], minlength=len(ids)) / np.maximum(total, 1)
+    return signs_of(looks, ids, shares, np.array([min(entry["obb"]["extent"]) for entry in entries]))
+
+
+def _moved(
+    visit: Visit, grown: Gaussians, things: list[tuple[np.ndarray, float]], gone: list[int], looks: list[Look]
+) -> dict[int, tuple[int, Motion]]:
+    """By id of an instance that is gone: the number of the new thing that it is, and its motion."""
+    if not gone or not things:
+        return {}
+    olds = {i: visit.thing(i) for i in gone}
+    depth = {entry["id"]: min(entry["obb"]["extent"]) for entry in visit.gmap.instances}
+    odds, found, cuts = np.full((len(gone), len(things)), -np.inf), {}, []
+    for j, (own, _) in enumerate(things):
+        new = grown.rows(torch.from_numpy(own))
+        rest = np.setdiff1d(np.arange(len(grown)), own)
+        cuts.append(cuts_of(looks, new, grown.rows(torch.from_numpy(rest))))
+        alike = [looks_alike(olds[i], new) for i in gone]
+        for a in np.argsort(alike, kind="stable")[::-1][:ALIKE]:
+            motions = motions_of(olds[gone[a]], new, cuts[j], UP, depth[gone[a]])
+            if motions:
+                odds[a, j], found[a, j] = motions[0][0].log_odds, motions
+        visit.run.progress.update("motions", j + 1, len(things))
+    pairs = {}
+    for a, j in assigned(odds, HOPELESS):
+        motion = settled(olds[gone[a]], found[a, j], cuts[j], depth[gone[a]])
+        rival = max((odds[b, j] for b in range(len(gone)) if b != a), default=-np.inf)
+        if motion.signs.log_odds > 0:
+            pairs[gone[a]] = (j, replace(motion, ambiguous=motion.ambiguous or rival > motion.signs.log_odds))
+    return pairs
+
+
+def _settled(
+    visit: Visit,
+    grown: Gaussians,
+    kept: np.ndarray,
+    ids: np.ndarray,
+    made: Grouping,
+    free: np.ndarray,
+    signs: list[Signs],
+    gone: list[int],
+    things: list[tuple[np.ndarray, float]],
+    pairs: dict[int, tuple[int, Motion]],
+    record: TrainRecord,
+) -> Today:
+    """Puts the Gaussians of moved things where the new ones grew, and trains the colours of all that was looked at."""
+    gmap, run = visit.gmap, visit.run
+    membership = np.concatenate([gmap.membership[kept], np.ones(len(grown) - len(kept), np.float32)])
+    membership[free] = np.where(made.ids >= 0, made.membership, 0)
+    parts = gmap.parts["ids"] if "ids" in gmap.parts else np.full(len(gmap), -1, np.int32)
+    part_ids = np.concatenate([parts[kept], np.full(len(grown) - len(kept), -1, np.int32)])
+    taken = {j for j, _ in pairs.values()}
+    used = [entry["id"] for entry in gmap.instances] + [p["id"] for e in gmap.instances for p in e.get("parts", ())]
+    following, added = max(used, default=-1) + 1, dict[int, float]()
+    for j, (rows, score) in enumerate(things):
+        if j not in taken:
+            ids[rows], added[following] = following, score
+            following += 1
+    replaced = np.concatenate([np.zeros(0, np.int64), *(things[j][0] for j in taken)])
+    stays = np.setdiff1d(np.arange(len(grown)), replaced)
+    pieces, names, members, owned = (
+        [grown.rows(torch.from_numpy(stays))],
+        [ids[stays]],
+        [membership[stays]],
+        [part_ids[stays]],
+    )
+    for i, (_, motion) in pairs.items():
+        old = np.flatnonzero(gmap.instance_ids == i)
+        pieces.append(carried(visit.thing(i), motion.new_from_old))
+        names.append(np.full(len(old), i, np.int32))
+        members.append(gmap.membership[old])
+        owned.append(parts[old])
+    together = Gaussians.concatenate(pieces)
+    config = update_config(run.config, len(visit.photos.views), SETTLING, len(together))
+    start = together.sh.clone()
+    final, last = trained(
+        run, "settle", visit.mark, visit.masks["identity"], together, len(together), visit.photos, config
+    )
+    unseen = (final.sh[: len(kept)] == start[: len(kept)]).flatten(1).all(dim=1)
+    original = torch.from_numpy(gmap.sh[kept])
+    final.sh[: len(kept)] = torch.where(unseen[:, None, None], original, final.sh[: len(kept)])
+    rest = np.setdiff1d(np.flatnonzero(~np.isin(gmap.instance_ids, gone)), visit.rows)  # no photo may show these
+    whole = Gaussians.concatenate([gaussians_of(gmap, rest), final])
+    names, members, owned = [gmap.instance_ids[rest], *names], [gmap.membership[rest], *members], [parts[rest], *owned]
+    arrays = (np.concatenate(names).astype(np.int32), np.concatenate(members), np.concatenate(owned).astype(np.int32))
+    motions = {i: motion for i, (_, motion) in pairs.items()}
+    record = TrainRecord.joined([record, last])
+    return Today(whole, np.concatenate([rest, kept]), *arrays, signs, gone, motions, added, record)
