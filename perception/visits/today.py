@@ -95,18 +95,10 @@ def seen_today(visit: Visit) -> Today:
 
 def _signs(visit: Visit) -> list[Signs]:
     gmap, entries = visit.gmap, visit.gmap.instances
-    looks = visit.looks(visit.gaussians, gmap.instance_ids)
-    seen = seen_rows(looks, gmap.means.astype(np.float64), gmap.scales.max(axis=1))
+    looks = visit.looks(visit.gaussians, visit.ids)
+    seen = seen_rows(looks, visit.gaussians.means.double().numpy(), visit.gaussians.scales.max(dim=1).values.numpy())
     ids = [entry["id"] for entry in entries]
-    order = np.argsort(ids)
-    position = (
-        order[np.clip(np.searchsorted(np.array(ids)[order], gmap.instance_ids), 0, len(ids) - 1)] if ids else None
-    )
-    shares = np.zeros(len(ids))
-    if position is not None:
-        owned = gmap.instance_ids >= 0
-        total = np.bincount(position[owned], minlength=len(ids))
-        shares = np.bincount(position[owned & seen], minlength=len(ids)) / np.maximum(total, 1)
+    shares = np.array([np.sum(seen & (visit.ids == i)) / max(1, np.sum(gmap.instance_ids == i)) for i in ids])
     return signs_of(looks, ids, shares, np.array([min(entry["obb"]["extent"]) for entry in entries]))
 
 

@@ -33,7 +33,7 @@ def gaussians_of(gmap: Map, rows: np.ndarray) -> Gaussians:
 class Visit:
     """The photos of a visit against the map. number: of the visit; rows [R]: of the map's Gaussians, those that a photo
     may show; gaussians: these, in the light of the visit, with instances ids [R]; light [3]: its colours over the
-    map's; photos: exposed and labelled; stereo: depths of the training photos; masks: report; mark: see `training_mark`."""
+    map's; photos: exposed and labelled; stereo: depths of the training photos; masks: report; mark: of its training."""
 
     run: Run
     gmap: Map
