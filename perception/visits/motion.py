@@ -19,7 +19,7 @@ from perception.gaussians.model import Gaussians
 from perception.gaussians.views import TrainingView
 from perception.geometry import nearest_rotation, rotations
 from perception.visits.evidence import Signs, signs_of
-from perception.visits.look import Look, look, projected
+from perception.visits.look import in_view, look, projected
 
 YAWS = 12
 """Starting rotations about the vertical; the 24 that map a cube's axes to each other are tried as well."""
@@ -30,18 +30,28 @@ TRIMMED = 0.8
 """Share of the new points that are compared: the rest are of neighbours, or were hidden in the first visit."""
 COLOUR = 1.0
 """Radii of a thing that a difference of colour of 1 counts as."""
-SIZES = (0.4, 2.0)
-"""Least and largest size of the new thing relative to the old one: a new thing may be half hidden."""
-JUDGED = 4
-"""Photos by which a motion is judged: those that show most of the new thing."""
+SOLID = 0.1
+"""Least opacity of a Gaussian that shows a surface."""
+REACH = 2.2
+"""Radii of a thing (root of the mean squared distance to its centre) within which all of it lies."""
+SIZES, LEAST_PART = (0.35, 1.6), 0.3
+"""Least and largest size of the new thing relative to the old one, which may be half hidden; least share of its points
+that lie within reach of each other, if it is that thing."""
+JUDGED, GLANCED, LARGE = 4, 2, 128
+"""Photos by which a motion is judged: those that show most of the new thing; by which all starts are; the long side in
+pixels from which their parts are halved."""
 MARGIN = 0.3
 """Of the cut around a thing in a photo, relative to its sides."""
 TURNED = 15.0
 """Degrees from which two motions are different ones."""
 HOPELESS = -4.0
 """Log-odds of a first guess below which a motion is not refined."""
-ALIKE = 4
-"""Old things, most alike in colour, with which a new one is compared."""
+ALIKE, LIKELY = 4, 2
+"""Old things, most alike in colour, with which a new one is compared; and of these, with which closely."""
+CERTAIN = 4.0
+"""Log-odds of a motion from which no other thing is tried."""
+MOVED, OUTLINE = 1.0, 0.5
+"""Least log-odds and least IoU of outlines for which a new thing is an old one."""
 GAINS = 0.02
 """Log-odds that a step of refinement must gain."""
 STEP, LEAST_STEP = 0.2, 0.02
@@ -60,10 +70,23 @@ class Points:
     colors: np.ndarray
 
     @classmethod
-    def of(cls, gaussians: Gaussians, least: float = 0.1) -> Points:
-        """The solid Gaussians' means and colours."""
-        solid = gaussians.opacities.numpy() >= least
+    def of(cls, gaussians: Gaussians) -> Points:
+        """The means and colours of the solid Gaussians."""
+        solid = gaussians.opacities.numpy() >= SOLID
         return cls(gaussians.means.double().numpy()[solid], gaussians.base_colors.double().numpy()[solid].clip(0, 1))
+
+    def within(self, radius: float) -> Points:
+        """The points in the ball about the densest spot in which a thing of this `radius` fits; strays are left out."""
+        from scipy.spatial import cKDTree
+
+        if len(self.points) == 0:
+            return self
+        counts = cKDTree(self.points).query_ball_point(self.points, radius, return_length=True)
+        centre = self.points[int(np.argmax(counts))]
+        for _ in range(ROUNDS[0]):
+            kept = np.linalg.norm(self.points - centre, axis=1) <= REACH * radius
+            centre = np.median(self.points[kept], axis=0)
+        return Points(self.points[kept], self.colors[kept])
 
     @property
     def radius(self) -> float:
@@ -191,53 +214,85 @@ class Cut:
     scene: Gaussians
 
 
-def cuts_of(looks: Sequence[Look], new: Gaussians, scene: Gaussians) -> list[Cut]:
-    """The parts of the JUDGED photos that show most of a new thing. scene: all else."""
-    found = [cut for shown in looks if (cut := _bounds(shown, new.means.double().numpy())) is not None]
-    found.sort(key=lambda cut: -cut[0])
-    return [_cut(shown, low, high, scene) for _, shown, low, high in found[:JUDGED]]
+Frame = tuple[TrainingView, np.ndarray]
+"""A photo, and the depth [h, w] that was measured in it, 0 = none."""
 
 
-def _bounds(shown: Look, points: np.ndarray) -> tuple[int, Look, np.ndarray, np.ndarray] | None:
-    """(pixels, look, corners) of the part of a photo around points [P, 3]; None where it shows less than half."""
-    pixel, z = projected(shown.view, points)
-    size = np.array(shown.mapped.shape[::-1])
+def cuts_of(frames: Sequence[Frame], points: np.ndarray, scene: Gaussians) -> list[Cut]:
+    """The parts of the JUDGED photos that show most of a new thing, points [P, 3]. scene: all else."""
+    found = [(bounds, frame) for frame in frames if (bounds := _bounds(frame[0], points)) is not None]
+    found.sort(key=lambda cut: -int((cut[0][1] - cut[0][0]).prod()))
+    return [_cut(*frame, low, high, scene) for (low, high), frame in found[:JUDGED]]
+
+
+def _bounds(view: TrainingView, points: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """The corners of the part of a photo around points [P, 3]; None where it shows less than half of them."""
+    pixel, z = projected(view, points)
+    size = np.array(view.photo.shape[1::-1])
     inside = (z > 1e-3) & ((pixel >= 0) & (pixel < size)).all(axis=1)
     if inside.mean() < 0.5:
         return None
     low, high = np.quantile(pixel[inside], [0.01, 0.99], axis=0)
     margin = MARGIN * (high - low) + 4
     low, high = np.maximum(np.floor(low - margin), 0).astype(int), np.minimum(np.ceil(high + margin), size).astype(int)
-    return None if (high - low < 8).any() else (int((high - low).prod()), shown, low, high)
+    return None if (high - low < 8).any() else (low, high)
 
 
-def _cut(shown: Look, low: np.ndarray, high: np.ndarray, scene: Gaussians) -> Cut:
-    view, part = shown.view, np.s_[low[1] : high[1], low[0] : high[0]]
+def _cut(view: TrainingView, measured: np.ndarray, low: np.ndarray, high: np.ndarray, scene: Gaussians) -> Cut:
+    part = np.s_[low[1] : high[1], low[0] : high[0]]
     K = view.K.clone()
     K[:2, 2] -= torch.from_numpy(low.astype(np.float32))
     images = {name: getattr(view, name) for name in ("photo", "labels", "weight")}
     own = {name: image[part].contiguous() for name, image in images.items() if image is not None}
-    pixel, z = projected(shown.view, scene.means.double().numpy())
-    reach = 3 * scene.scales.max(dim=1).values.double().numpy() / np.maximum(z, 1e-6) * float(view.K[0, 0])
-    near = (z > 0) & ((pixel + reach[:, None] > low) & (pixel - reach[:, None] < high)).all(axis=1)
-    return Cut(
-        replace(view, K=K, depth=None, **own), shown.measured[part], scene.rows(torch.from_numpy(near.nonzero()[0]))
+    near = in_view(
+        scene.means.numpy(), scene.scales.max(dim=1).values.numpy(), [small := replace(view, K=K, depth=None, **own)]
     )
+    measured = measured[part]
+    while max(small.photo.shape[:2]) > LARGE:
+        height, width = (side // 2 for side in small.photo.shape[:2])
+        small, measured = small.halved(), measured[: 2 * height : 2, : 2 * width : 2]
+    return Cut(small, measured, scene.rows(torch.from_numpy(near.nonzero()[0])))
+
+
+Found = tuple[Signs, np.ndarray]
+"""The signs of a motion and new_from_old [4, 4]."""
 
 
 def motions_of(
-    old: Gaussians, new: Gaussians, cuts: Sequence[Cut], up: np.ndarray, depth: float
-) -> list[tuple[Signs, np.ndarray]]:
-    """Signs and new_from_old [4, 4] of the likeliest motions from an old thing to a new one, in `cuts_of` it, the best
-    first; none where their sizes differ. depth: smallest extent of the old thing."""
-    a, b = Points.of(old), Points.of(new)
-    if not cuts or min(len(a.points), len(b.points)) < 8 or not SIZES[0] <= b.radius / max(a.radius, 1e-9) <= SIZES[1]:
-        return []
-    found = [(judged(old, pose, cuts, depth), pose) for _, pose in register(a, b, up)]
-    return sorted(found, key=lambda motion: -motion[0].log_odds)
+    old: Gaussians, new: Gaussians, frames: Sequence[Frame], scene: Gaussians, up: np.ndarray, depth: float
+) -> tuple[list[Found], list[Cut]]:
+    """The likeliest motions from an old thing to a new one, the best first, and the parts of photos by which they were
+    judged; none where their sizes differ. scene: all else; depth: smallest extent of the old thing."""
+    a, whole = Points.of(old), Points.of(new)
+    if len(a.points) < 8 or len(whole.points) < 8:
+        return [], []
+    b = whole.within(a.radius)
+    fits = SIZES[0] <= b.radius / max(a.radius, 1e-9) <= SIZES[1] and len(b.points) >= LEAST_PART * len(whole.points)
+    cuts = cuts_of(frames, b.points, scene) if fits and len(b.points) >= 8 else []
+    if not cuts:
+        return [], []
+    starts = [pose for _, pose in register(a, b, up)] + _upright_starts(a, b, up)
+    glanced = [(judged(old, pose, cuts[:GLANCED], depth), pose) for pose in starts]
+    glanced.sort(key=lambda motion: -motion[0].log_odds)
+    found = [(judged(old, pose, cuts, depth), pose) for _, pose in glanced[:BEST]]
+    return sorted(found, key=lambda motion: -motion[0].log_odds), cuts
 
 
-def settled(old: Gaussians, found: Sequence[tuple[Signs, np.ndarray]], cuts: Sequence[Cut], depth: float) -> Motion:
+def _upright_starts(a: Points, b: Points, up: np.ndarray) -> list[np.ndarray]:
+    """Turns about the vertical that bring box a onto box b, the lowest points onto each other."""
+    poses = []
+    for rotation in _starts(up)[:YAWS]:
+        turned = a.points @ rotation.T
+        (low_a, high_a), (low_b, high_b) = (np.quantile(points, [0.03, 0.97], axis=0) for points in (turned, b.points))
+        step = (low_b + high_b - low_a - high_a) / 2
+        step += up * ((low_b - low_a - step) @ up)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, step
+        poses.append(pose)
+    return poses
+
+
+def settled(old: Gaussians, found: Sequence[Found], cuts: Sequence[Cut], depth: float) -> Motion:
     """The best of the two best motions after refinement, and whether the other explains the photos as well."""
     refine = [refined(old, pose, cuts, depth) for _, pose in found[:2]]
     refine.sort(key=lambda motion: -motion[0].log_odds)

@@ -23,14 +23,17 @@ from perception.visits.growth import (
     trained,
     update_config,
 )
-from perception.visits.look import Look
 from perception.visits.motion import (
     ALIKE,
+    CERTAIN,
+    CLOSE,
     HOPELESS,
+    LIKELY,
+    MOVED,
+    OUTLINE,
     Motion,
     assigned,
     carried,
-    cuts_of,
     looks_alike,
     motions_of,
     settled,
@@ -88,8 +91,7 @@ def seen_today(visit: Visit) -> Today:
         made = grouped(grown, votes, free, run.config)
     things = [(free[made.ids == n], float(made.scores[n])) for n in range(made.count)]
     with run.stage("motion"):
-        looks = visit.looks(grown, ids)
-        pairs = _moved(visit, grown, things, gone, looks)
+        pairs = _moved(visit, grown, things, gone)
     return _settled(visit, grown, kept, ids, made, free, signs, gone, things, pairs, record)
 
 
@@ -103,30 +105,32 @@ def _signs(visit: Visit) -> list[Signs]:
 
 
 def _moved(
-    visit: Visit, grown: Gaussians, things: list[tuple[np.ndarray, float]], gone: list[int], looks: list[Look]
+    visit: Visit, grown: Gaussians, things: list[tuple[np.ndarray, float]], gone: list[int]
 ) -> dict[int, tuple[int, Motion]]:
     """By id of an instance that is gone: the number of the new thing that it is, and its motion."""
     if not gone or not things:
         return {}
     olds = {i: visit.thing(i) for i in gone}
     depth = {entry["id"]: min(entry["obb"]["extent"]) for entry in visit.gmap.instances}
-    odds, found, cuts = np.full((len(gone), len(things)), -np.inf), {}, []
+    odds, motions = np.full((len(gone), len(things)), -np.inf), dict[tuple[int, int], Motion]()
     for j, (own, _) in enumerate(things):
         new = grown.rows(torch.from_numpy(own))
-        rest = np.setdiff1d(np.arange(len(grown)), own)
-        cuts.append(cuts_of(looks, new, grown.rows(torch.from_numpy(rest))))
-        alike = [looks_alike(olds[i], new) for i in gone]
-        for a in np.argsort(alike, kind="stable")[::-1][:ALIKE]:
-            motions = motions_of(olds[gone[a]], new, cuts[j], UP, depth[gone[a]])
-            if motions:
-                odds[a, j], found[a, j] = motions[0][0].log_odds, motions
+        rest = grown.rows(torch.from_numpy(np.setdiff1d(np.arange(len(grown)), own)))
+        alike = np.argsort([looks_alike(olds[i], new) for i in gone], kind="stable")[::-1][:ALIKE]
+        guesses = {a: motions_of(olds[gone[a]], new, visit.frames, rest, UP, depth[gone[a]]) for a in alike.tolist()}
+        guesses = {a: guess for a, guess in guesses.items() if guess[0] and guess[0][0][0].log_odds > HOPELESS}
+        for a in sorted(guesses, key=lambda a: -guesses[a][0][0][0].log_odds)[:LIKELY]:
+            motion = settled(olds[gone[a]], *guesses[a], depth[gone[a]])
+            if not motion.signs.outline < OUTLINE:
+                odds[a, j], motions[a, j] = motion.signs.log_odds, motion
+            if motion.signs.log_odds > CERTAIN:
+                break
         visit.run.progress.update("motions", j + 1, len(things))
     pairs = {}
-    for a, j in assigned(odds, HOPELESS):
-        motion = settled(olds[gone[a]], found[a, j], cuts[j], depth[gone[a]])
-        rival = max((odds[b, j] for b in range(len(gone)) if b != a), default=-np.inf)
-        if motion.signs.log_odds > 0:
-            pairs[gone[a]] = (j, replace(motion, ambiguous=motion.ambiguous or rival > motion.signs.log_odds))
+    for a, j in assigned(odds, MOVED):
+        rivals = np.concatenate([np.delete(odds[:, j], a), np.delete(odds[a], j)])
+        alike = rivals.max(initial=-np.inf) > odds[a, j] - CLOSE
+        pairs[gone[a]] = (j, replace(motions[a, j], ambiguous=motions[a, j].ambiguous or bool(alike)))
     return pairs
 
 

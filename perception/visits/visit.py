@@ -12,6 +12,7 @@ import torch
 
 from perception.gaussians.model import Gaussians
 from perception.gaussians.photos import split_scene
+from perception.gaussians.views import TrainingView
 from perception.map.map import Map
 from perception.masks import MaskSource
 from perception.masks.stereo import StereoView
@@ -54,6 +55,12 @@ class Visit:
     def thing(self, instance: int) -> Gaussians:
         """All Gaussians of an instance of the map, in the light of the visit."""
         return in_light(gaussians_of(self.gmap, np.flatnonzero(self.gmap.instance_ids == instance)), self.light)
+
+    @property
+    def frames(self) -> list[tuple[TrainingView, np.ndarray]]:
+        """The training photos at full size, and what was measured in them."""
+        pairs = zip(self.photos.views, self.stereo, strict=True)
+        return [(view, depth_at(stereo, view.photo.shape)) for view, stereo in pairs]
 
     def looks(self, gaussians: Gaussians, ids: np.ndarray) -> list[Look]:
         """The training photos beside the Gaussians with instances ids [N]."""
