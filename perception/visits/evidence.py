@@ -24,6 +24,9 @@ UNSEEN = 0.12
 WEIGHTS = {"correlation": (14.0, 0.52), "outline": (3.0, 0.60), "colour": (-8.0, 0.12), "through": (-2.0, 0.20)}
 """Log-odds of "still there" per unit of each sign, and the value at which a sign says nothing."""
 
+SAME_OUTLINE = 6.0
+"""Further log-odds per unit of the outlines' IoU for a thing at a new spot, where another thing may stand."""
+
 
 @dataclass(frozen=True)
 class Signs:
@@ -45,6 +48,12 @@ class Signs:
         """Of the thing standing where it stood, positive for yes."""
         values = ((getattr(self, name), *weight) for name, weight in WEIGHTS.items())
         return float(sum(slope * (value - middle) for value, slope, middle in values if np.isfinite(value)))
+
+    @property
+    def same(self) -> float:
+        """Log-odds of being the thing that stands at a new spot: outlines count more, which of other things differ."""
+        outline = 0.0 if np.isnan(self.outline) else SAME_OUTLINE * (self.outline - WEIGHTS["outline"][1])
+        return self.log_odds + outline
 
     @property
     def seen(self) -> bool:

@@ -16,10 +16,10 @@ import numpy as np
 import torch
 
 from perception.gaussians.model import Gaussians
-from perception.gaussians.views import TrainingView
+from perception.gaussians.views import TrainingView, expected_depth, render
 from perception.geometry import nearest_rotation, rotations
 from perception.visits.evidence import Signs, signs_of
-from perception.visits.look import in_view, look, projected
+from perception.visits.look import Look, moments, projected
 
 YAWS = 12
 """Starting rotations about the vertical; the 24 that map a cube's axes to each other are tried as well."""
@@ -30,6 +30,8 @@ TRIMMED = 0.8
 """Share of the new points that are compared: the rest are of neighbours, or were hidden in the first visit."""
 COLOUR = 1.0
 """Radii of a thing that a difference of colour of 1 counts as."""
+VISIBLE, TOUCHING = 0.3, 0.02
+"""Least opacity of a pixel that shows a thing; relative depth by which it may lie behind what it stands on."""
 SOLID = 0.1
 """Least opacity of a Gaussian that shows a surface."""
 REACH = 2.2
@@ -37,25 +39,25 @@ REACH = 2.2
 SIZES, LEAST_PART = (0.35, 1.6), 0.3
 """Least and largest size of the new thing relative to the old one, which may be half hidden; least share of its points
 that lie within reach of each other, if it is that thing."""
-JUDGED, GLANCED, LARGE = 4, 2, 128
-"""Photos by which a motion is judged: those that show most of the new thing; by which all starts are; the long side in
-pixels from which their parts are halved."""
+JUDGED, LARGE, SMALL = 4, 128, 48
+"""Photos by which a motion is judged: those that show most of the new thing; the long side in pixels from which their
+parts are halved, and from which they are to find a motion at first, when it may be far off."""
 MARGIN = 0.3
 """Of the cut around a thing in a photo, relative to its sides."""
 TURNED = 15.0
 """Degrees from which two motions are different ones."""
 HOPELESS = -4.0
 """Log-odds of a first guess below which a motion is not refined."""
-ALIKE, LIKELY = 4, 2
+ALIKE, LIKELY = 3, 2
 """Old things, most alike in colour, with which a new one is compared; and of these, with which closely."""
 CERTAIN = 4.0
 """Log-odds of a motion from which no other thing is tried."""
-MOVED, OUTLINE = 1.0, 0.5
-"""Least log-odds and least IoU of outlines for which a new thing is an old one."""
+MOVED = 1.2
+"""Least log-odds for which a new thing is an old one."""
 GAINS = 0.02
 """Log-odds that a step of refinement must gain."""
-STEP, LEAST_STEP = 0.2, 0.02
-"""Steps of a motion in refinement: radii of the thing, and radians."""
+ROUGH_STEP, STEP, LEAST_STEP = 0.4, 0.1, 0.015
+"""Steps of a motion in refinement, from a rough one down: radii of the thing, and radians."""
 BINS = 6
 """Of each colour in the histograms by which pairs are chosen."""
 CLOSE = 1.5
@@ -169,7 +171,7 @@ def carried(gaussians: Gaussians, new_from_old: np.ndarray) -> Gaussians:
     return replace(
         gaussians,
         means=torch.from_numpy(means.astype(np.float32)),
-        quats=torch.from_numpy(turned.astype(np.float32)),
+        quats=torch.from_numpy(np.ascontiguousarray(turned, np.float32)),
         sh=turned_harmonics(gaussians.sh, rotation),
     )
 
@@ -183,7 +185,7 @@ def turned_harmonics(sh: torch.Tensor, rotation: np.ndarray) -> torch.Tensor:
     directions = np.random.default_rng(0).normal(size=(64, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     turn = np.linalg.lstsq(harmonics(directions)[:, :count], harmonics(directions @ rotation)[:, :count], rcond=None)[0]
-    return torch.einsum("ij,njc->nic", torch.from_numpy(turn.astype(np.float32)), sh)
+    return torch.einsum("ij,njc->nic", torch.from_numpy(turn.astype(np.float32)), sh).contiguous()
 
 
 def harmonics(d: np.ndarray) -> np.ndarray:
@@ -207,11 +209,41 @@ def harmonics(d: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Cut:
-    """A part of a photo: view and measured depth of it, and the Gaussians that it may show beside a thing."""
+    """A part of a photo, and what the map shows there beside a thing. view; measured [h, w] depth, 0 = none; image
+    [h, w, 3] and depth [h, w] (infinite where nothing is) of all else."""
 
     view: TrainingView
     measured: np.ndarray
-    scene: Gaussians
+    image: np.ndarray
+    depth: np.ndarray
+
+    def halved_to(self, most: int) -> Cut:
+        """The part with a long side of at most about `most` pixels."""
+        cut = self
+        while max(cut.view.photo.shape[:2]) > most:
+            height, width = (side // 2 for side in cut.view.photo.shape[:2])
+            part = np.s_[: 2 * height : 2, : 2 * width : 2]
+            image = cut.image[: 2 * height, : 2 * width].reshape(height, 2, width, 2, 3).mean(axis=(1, 3))
+            cut = Cut(cut.view.halved(), cut.measured[part], image, cut.depth[part])
+        return cut
+
+    def with_thing(self, thing: Gaussians) -> Look:
+        """The part beside a render of all else with a thing, which is instance 0: the nearer of the two surfaces."""
+        view, (height, width) = self.view, self.depth.shape
+        out = render(thing, view.camera_from_world, view.K, width, height, harmonics=True, eps2d=view.eps2d)
+        assert out.depths is not None  # for the type checker
+        alpha = out.alphas[0].numpy()
+        depth = np.where(alpha > VISIBLE, out.depths[0].numpy() / np.maximum(alpha, 1e-6), np.inf)
+        front = depth < self.depth * (1 + TOUCHING)
+        weight = np.where(front, alpha, 0)[..., None]
+        own = np.where(front[..., None], view.exposed(out.colors[0]).numpy(), 0)
+        image = (own + (1 - weight) * self.image).clip(0, 1).astype(np.float32)
+        photo = view.photo.numpy().astype(np.float32) / 255
+        mapped = np.where(front, depth, np.where(np.isfinite(self.depth), self.depth, 0)).astype(np.float32)
+        ids = np.where(front, 0, -1)
+        if view.weight is not None:
+            ids[view.weight.numpy() == 0] = -1
+        return Look(view, mapped, self.measured, ids, *moments(image, photo), np.abs(image - photo).mean(axis=2))
 
 
 Frame = tuple[TrainingView, np.ndarray]
@@ -244,14 +276,12 @@ def _cut(view: TrainingView, measured: np.ndarray, low: np.ndarray, high: np.nda
     K[:2, 2] -= torch.from_numpy(low.astype(np.float32))
     images = {name: getattr(view, name) for name in ("photo", "labels", "weight")}
     own = {name: image[part].contiguous() for name, image in images.items() if image is not None}
-    near = in_view(
-        scene.means.numpy(), scene.scales.max(dim=1).values.numpy(), [small := replace(view, K=K, depth=None, **own)]
-    )
-    measured = measured[part]
-    while max(small.photo.shape[:2]) > LARGE:
-        height, width = (side // 2 for side in small.photo.shape[:2])
-        small, measured = small.halved(), measured[: 2 * height : 2, : 2 * width : 2]
-    return Cut(small, measured, scene.rows(torch.from_numpy(near.nonzero()[0])))
+    small = replace(view, K=K, depth=None, **own)
+    size = small.photo.shape[1::-1]
+    out = render(scene, small.camera_from_world, small.K, *size, harmonics=True, eps2d=small.eps2d)
+    depth = expected_depth(out).numpy()
+    image = small.exposed(out.colors[0]).numpy()
+    return Cut(small, measured[part], image, np.where(depth > 0, depth, np.inf)).halved_to(LARGE)
 
 
 Found = tuple[Signs, np.ndarray]
@@ -272,10 +302,23 @@ def motions_of(
     if not cuts:
         return [], []
     starts = [pose for _, pose in register(a, b, up)] + _upright_starts(a, b, up)
-    glanced = [(judged(old, pose, cuts[:GLANCED], depth), pose) for pose in starts]
-    glanced.sort(key=lambda motion: -motion[0].log_odds)
-    found = [(judged(old, pose, cuts, depth), pose) for _, pose in glanced[:BEST]]
-    return sorted(found, key=lambda motion: -motion[0].log_odds), cuts
+    small = [cut.halved_to(SMALL) for cut in cuts]
+    rough = sorted(((judged(old, pose, small, depth), pose) for pose in starts), key=_falling)
+    rough = [refined(old, pose, small, depth, ROUGH_STEP, STEP) for _, pose in _distinct(rough)[:BEST]]
+    return sorted(((judged(old, pose, cuts, depth), pose) for _, pose in _distinct(rough)), key=_falling), cuts
+
+
+def _falling(motion: Found) -> float:
+    return -motion[0].same
+
+
+def _distinct(found: Sequence[Found]) -> list[Found]:
+    """The motions whose rotations differ from those of all better ones, the best first."""
+    kept: list[Found] = []
+    for motion in sorted(found, key=_falling):
+        if all(angle_between(motion[1], other) > TURNED for _, other in kept):
+            kept.append(motion)
+    return kept
 
 
 def _upright_starts(a: Points, b: Points, up: np.ndarray) -> list[np.ndarray]:
@@ -294,31 +337,27 @@ def _upright_starts(a: Points, b: Points, up: np.ndarray) -> list[np.ndarray]:
 
 def settled(old: Gaussians, found: Sequence[Found], cuts: Sequence[Cut], depth: float) -> Motion:
     """The best of the two best motions after refinement, and whether the other explains the photos as well."""
-    refine = [refined(old, pose, cuts, depth) for _, pose in found[:2]]
-    refine.sort(key=lambda motion: -motion[0].log_odds)
+    refine = _distinct([refined(old, pose, cuts, depth, STEP, LEAST_STEP) for _, pose in found[:2]])
     (signs, pose), others = refine[0], refine[1:]
-    alike = any(s.log_odds > signs.log_odds - CLOSE and angle_between(pose, other) > TURNED for s, other in others)
-    return Motion(pose, signs, alike)
+    return Motion(pose, signs, any(other.same > signs.same - CLOSE for other, _ in others))
 
 
 def judged(old: Gaussians, pose: np.ndarray, cuts: Sequence[Cut], depth: float) -> Signs:
     """What the photos say about the old thing, carried by `pose`."""
-    thing, found = carried(old, pose), []
-    for cut in cuts:
-        ids = np.full(len(cut.scene) + len(thing), -1, np.int32)
-        ids[len(cut.scene) :] = 0
-        found.append(look(Gaussians.concatenate([cut.scene, thing]), ids, cut.view, cut.measured))
-    return signs_of(found, [0], np.ones(1), np.array([depth]))[0]
+    thing = carried(old, pose)
+    return signs_of([cut.with_thing(thing) for cut in cuts], [0], np.ones(1), np.array([depth]))[0]
 
 
-def refined(old: Gaussians, pose: np.ndarray, cuts: Sequence[Cut], depth: float) -> tuple[Signs, np.ndarray]:
+def refined(
+    old: Gaussians, pose: np.ndarray, cuts: Sequence[Cut], depth: float, step: float, least: float
+) -> tuple[Signs, np.ndarray]:
     """The motion near `pose` that the photos support best: steps along and about three axes, halved when none helps."""
     from scipy.spatial.transform import Rotation
 
     points = Points.of(old)
     middle, radius = points.points.mean(axis=0), points.radius
-    best, step = judged(old, pose, cuts, depth), STEP
-    while step >= LEAST_STEP:
+    best = judged(old, pose, cuts, depth)
+    while step >= least:
         better = False
         for axis, sign in ((axis, sign) for axis in range(6) for sign in (1, -1)):
             change = np.zeros(6)
@@ -327,7 +366,7 @@ def refined(old: Gaussians, pose: np.ndarray, cuts: Sequence[Cut], depth: float)
             moved[:3, :3] = Rotation.from_rotvec(change[3:]).as_matrix() @ pose[:3, :3]
             moved[:3, 3] = pose[:3, :3] @ middle + pose[:3, 3] + radius * change[:3] - moved[:3, :3] @ middle
             signs = judged(old, moved, cuts, depth)
-            if signs.log_odds > best.log_odds + GAINS:
+            if signs.same > best.same + GAINS:
                 best, pose, better = signs, moved, True
         step = step if better else step / 2
     return best, pose

@@ -30,7 +30,6 @@ from perception.visits.motion import (
     HOPELESS,
     LIKELY,
     MOVED,
-    OUTLINE,
     Motion,
     assigned,
     carried,
@@ -118,12 +117,11 @@ def _moved(
         rest = grown.rows(torch.from_numpy(np.setdiff1d(np.arange(len(grown)), own)))
         alike = np.argsort([looks_alike(olds[i], new) for i in gone], kind="stable")[::-1][:ALIKE]
         guesses = {a: motions_of(olds[gone[a]], new, visit.frames, rest, UP, depth[gone[a]]) for a in alike.tolist()}
-        guesses = {a: guess for a, guess in guesses.items() if guess[0] and guess[0][0][0].log_odds > HOPELESS}
-        for a in sorted(guesses, key=lambda a: -guesses[a][0][0][0].log_odds)[:LIKELY]:
+        guesses = {a: guess for a, guess in guesses.items() if guess[0] and guess[0][0][0].same > HOPELESS}
+        for a in sorted(guesses, key=lambda a: -guesses[a][0][0][0].same)[:LIKELY]:
             motion = settled(olds[gone[a]], *guesses[a], depth[gone[a]])
-            if not motion.signs.outline < OUTLINE:
-                odds[a, j], motions[a, j] = motion.signs.log_odds, motion
-            if motion.signs.log_odds > CERTAIN:
+            odds[a, j], motions[a, j] = motion.signs.same, motion
+            if motion.signs.same > CERTAIN:
                 break
         visit.run.progress.update("motions", j + 1, len(things))
     pairs = {}
