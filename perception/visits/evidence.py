@@ -60,10 +60,10 @@ class Signs:
         """Whether the visit saw enough of it to judge."""
         return self.photos > 0 and self.share >= UNSEEN
 
-    @property
-    def probability(self) -> float:
-        """Of standing where it stood."""
-        return float(1 / (1 + np.exp(-np.clip(self.log_odds, -30, 30))))
+
+def probability(log_odds: float) -> float:
+    """In [0, 1], of log-odds."""
+    return float(1 / (1 + np.exp(-np.clip(log_odds, -30, 30))))
 
 
 def signs_of(looks: Sequence[Look], things: Sequence[int], shares: np.ndarray, depths: np.ndarray) -> list[Signs]:

@@ -15,7 +15,7 @@ from perception.language.description import from_arrays, to_arrays
 from perception.map.history import is_removed, visits_of
 from perception.map.map import Map, language_in, prefixed
 from perception.photos.decode import open_photo
-from perception.visits.evidence import UNSEEN, Signs
+from perception.visits.evidence import UNSEEN, Signs, probability
 from perception.visits.motion import Motion
 
 _GEOMETRY = ("num_gaussians", "centroid", "obb", "aabb")
@@ -68,19 +68,19 @@ def recorded(entry: dict[str, Any], visit: int, signs: Signs, motion: Motion | N
         return {**entry, "state": "unseen", "confidence": round(1 - 0.5 * min(1.0, signs.share / UNSEEN), 3)}
     if not gone:
         return {
-            **entry, "state": "unchanged", "confidence": round(signs.probability, 3), "last_seen": visit,
+            **entry, "state": "unchanged", "confidence": round(probability(signs.log_odds), 3), "last_seen": visit,
             "last_looked_for": visit,
         }  # fmt: skip
     stood = {"until": visit - 1, **{key: entry[key] for key in _GEOMETRY[1:] if key in entry}}
-    stood["transform"] = None if motion is None or motion.ambiguous is None else motion.new_from_old.tolist()
+    stood["transform"] = None if motion is None else motion.new_from_old.tolist()
     if motion is not None and motion.ambiguous:
         stood["ambiguous"] = True
-    past, sure = [*entry.get("past", ()), stood], 1 - signs.probability
+    past, sure = [*entry.get("past", ()), stood], 1 - probability(signs.log_odds)
     if motion is None:
         entry = {key: value for key, value in entry.items() if key != "parts"}
         entry |= {"state": "removed", "confidence": round(sure, 3), "num_gaussians": 0}
     else:
-        entry |= {"state": "moved", "confidence": round(sure * motion.signs.probability, 3), "last_seen": visit}
+        entry |= {"state": "moved", "confidence": round(sure * probability(motion.signs.same), 3), "last_seen": visit}
     return {**entry, "last_looked_for": visit, "past": past}
 
 

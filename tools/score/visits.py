@@ -81,7 +81,9 @@ def owners(gmap: Map, points: np.ndarray, true: np.ndarray) -> dict[int, int]:
 
 def scores(changes: list[dict[str, Any]], first: Map, second: Map, truth: Truth) -> dict[str, Any]:
     """Precision, recall and F1 of each state, false alarms, unseen things called removed, errors of motions, ids kept."""
-    before, after = (owners(gmap, *pair) for gmap, pair in zip((first, second), zip(truth.points, truth.ids), strict=True))
+    before, after = (
+        owners(gmap, *pair) for gmap, pair in zip((first, second), zip(truth.points, truth.ids), strict=True)
+    )
     said = {change["instance_id"]: change for change in changes if change["state"] != "added"}
     added = {change["instance_id"] for change in changes if change["state"] == "added"}
     right, wrong, true = (dict.fromkeys(STATES, 0) for _ in range(3))
@@ -111,7 +113,9 @@ def scores(changes: list[dict[str, Any]], first: Map, second: Map, truth: Truth)
             unseen += 1
             lost += told["state"] == "removed"
         if told["state"] == "moved" and told.get("transform") and truth.entries[thing]["transform"]:
-            errors.append(_error(np.array(told["transform"]), np.array(truth.entries[thing]["transform"]), thing, truth))
+            errors.append(
+                _error(np.array(told["transform"]), np.array(truth.entries[thing]["transform"]), thing, truth)
+            )
     table = {
         state: {
             "precision": right[state] / max(1, right[state] + wrong[state]),
@@ -190,7 +194,8 @@ def main() -> None:
         return made
 
     first, apart = (
-        mapped(folder, given.work / f"{name}.gsmap") for folder, name in ((given.first, "first"), (given.second, "apart"))
+        mapped(folder, given.work / f"{name}.gsmap")
+        for folder, name in ((given.first, "first"), (given.second, "apart"))
     )
     output, start = given.work / "today.gsmap", time.monotonic()
     if not output.exists():
