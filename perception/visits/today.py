@@ -39,7 +39,8 @@ from perception.visits.motion import (
 )
 from perception.visits.visit import Visit, gaussians_of
 
-UP = np.array([0.0, 0.0, 1.0])
+UP = (0.0, 0.0, 1.0)
+"""Of a map that does not record gravity."""
 
 
 @dataclass
@@ -111,12 +112,14 @@ def _moved(
         return {}
     olds = {i: visit.thing(i) for i in gone}
     depth = {entry["id"]: min(entry["obb"]["extent"]) for entry in visit.gmap.instances}
+    gravity = visit.gmap.info.get("gravity")
+    up = np.array(UP) if gravity is None else -np.array(gravity["direction"], np.float64)
     odds, motions = np.full((len(gone), len(things)), -np.inf), dict[tuple[int, int], Motion]()
     for j, (own, _) in enumerate(things):
         new = grown.rows(torch.from_numpy(own))
         rest = grown.rows(torch.from_numpy(np.setdiff1d(np.arange(len(grown)), own)))
         alike = np.argsort([looks_alike(olds[i], new) for i in gone], kind="stable")[::-1][:ALIKE]
-        guesses = {a: motions_of(olds[gone[a]], new, visit.frames, rest, UP, depth[gone[a]]) for a in alike.tolist()}
+        guesses = {a: motions_of(olds[gone[a]], new, visit.frames, rest, up, depth[gone[a]]) for a in alike.tolist()}
         guesses = {a: guess for a, guess in guesses.items() if guess[0] and guess[0][0][0].same > HOPELESS}
         for a in sorted(guesses, key=lambda a: -guesses[a][0][0][0].same)[:LIKELY]:
             motion = settled(olds[gone[a]], *guesses[a], depth[gone[a]])

@@ -155,6 +155,7 @@ def assembled(visit: Visit, today: Today, described: DescribedInstances, output:
     views = [*(moved_record(view, gmap.path, output) for view in old), *_views(visit, output)]
     info = {**gmap.info, "visits": visits_with(gmap, run.source, [v.photo for v in views if v.visit == number])}
     info |= {"quality": quality, "config": run.config.to_json(), "fingerprint": mark, "seconds": dict(run.seconds)}
+    info["instances"] = {**info.get("instances", {}), "count": len(instances)}
     info |= {"training": asdict(today.record), "masks": visit.masks}
     return Map(
         **arrays,

@@ -15,7 +15,7 @@ BOX = np.s_[10:30, 10:40]
 
 
 def shown(measured: float, *, same: bool = True, cover: int = 0) -> Look:
-    """A photo of a thing in BOX at a depth of 2, where `measured` was measured; cover: columns hidden by something at 1."""
+    """A photo of a thing in BOX at a depth of 2, where `measured` was measured; cover: its columns behind another."""
     rng = np.random.default_rng(0)
     inside = np.zeros(SHAPE, bool)
     inside[BOX] = True

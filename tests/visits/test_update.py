@@ -77,7 +77,7 @@ def test_states_are_the_true_ones(world: Path, new: Map) -> None:
 
 
 def test_what_stays_keeps_its_ids_and_its_geometry(world: Path, new: Map) -> None:
-    """Every Gaussian of the old map that is still there has the same bits, but for its colours; none is trained away."""
+    """Every Gaussian of the old map that is still there has the same bits, but for its colours."""
     old = read_map(world / "old.gsmap")
     gone = {e["id"] for e in new.instances if e["state"] == "removed"}
     names = ("means", "quats", "log_scales", "opacity_logits", "features")

@@ -29,6 +29,7 @@ from perception.visits.scene import update_settings
 from perception.visits.update import update_map
 
 STATES = ("unchanged", "moved", "removed", "unseen", "added")
+CHANGED = ("moved", "removed", "added")
 UNSEEN, PARTLY = 0.05, 0.25
 NEAR = 0.05
 """Metres between the centres of two instances of one thing, in the naive way; sizes within a factor of 1.5."""
@@ -80,10 +81,8 @@ def owners(gmap: Map, points: np.ndarray, true: np.ndarray) -> dict[int, int]:
 
 
 def scores(changes: list[dict[str, Any]], first: Map, second: Map, truth: Truth) -> dict[str, Any]:
-    """Precision, recall and F1 of each state, false alarms, unseen things called removed, errors of motions, ids kept."""
-    before, after = (
-        owners(gmap, *pair) for gmap, pair in zip((first, second), zip(truth.points, truth.ids), strict=True)
-    )
+    """Precision, recall and F1 of each state; false alarms, unseen things called removed, errors of motions, ids."""
+    before, after = owners(first, truth.points[0], truth.ids[0]), owners(second, truth.points[1], truth.ids[1])
     said = {change["instance_id"]: change for change in changes if change["state"] != "added"}
     added = {change["instance_id"] for change in changes if change["state"] == "added"}
     right, wrong, true = (dict.fromkeys(STATES, 0) for _ in range(3))
@@ -128,7 +127,7 @@ def scores(changes: list[dict[str, Any]], first: Map, second: Map, truth: Truth)
     median = np.median(errors, axis=0).tolist() if errors else [None, None]
     return {
         "states": table,
-        "f1": float(np.mean([table[state]["f1"] for state in ("moved", "removed", "added") if table[state]["true"]] or [0])),
+        "f1": float(np.mean([table[state]["f1"] for state in CHANGED if table[state]["true"]] or [0])),
         "false_alarms": alarms / max(1, unchanged), "unseen_called_removed": lost / max(1, unseen),
         "motion_cm": median[0], "motion_degrees": median[1], "ids_kept": float(np.mean(kept)) if kept else None,
     }  # fmt: skip

@@ -181,7 +181,7 @@ def changes(before: DemoTruth, after: DemoTruth, visit: Visit, pictures: list[Pi
 
 
 def _seen(points: np.ndarray, number: int | None, cameras: list[Camera], pictures: list[Picture]) -> float:
-    """Share of points [P, 3] that some photo sees: on the surface of thing `number`, or with nothing in front (None)."""
+    """Share of points [P, 3] that some photo sees: on the surface of thing `number`, or None: nothing in front."""
     seen = np.zeros(len(points), bool)
     for camera, picture in zip(cameras, pictures, strict=True):
         pixels, depth = camera.project(points)
