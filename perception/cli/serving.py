@@ -20,6 +20,7 @@ def register(commands: Any) -> None:
     p.add_argument("--workers", type=int, default=2, metavar="N", help="questions answered at once")
     p.add_argument("--queue", type=int, default=64, metavar="N", help="questions that may wait; more are refused")
     p.add_argument("--watch", type=float, default=1.0, metavar="S", help="look for a new map this often, 0: never")
+    _add_photos(p)
 
     p = map_command(commands, "mcp", _mcp, "a map as tools of a language model (MCP), over stdio or HTTP; read-only")
     p.set_defaults(interrupted="stopped")
@@ -40,7 +41,7 @@ def register(commands: Any) -> None:
 
 
 def _add_photos(command: Any) -> None:
-    text = "also show photos in this folder; else only those in the map's own: a map from others may name any file"
+    text = "also use photos in this folder; else only those in the map's own: a map from others may name any file"
     command.add_argument("--photos", type=_folder, metavar="DIR", help=text)
 
 
@@ -62,7 +63,7 @@ def _settings(args: argparse.Namespace, **given: Any) -> Any:
 def _serve(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.serve.server import serve
 
-    names = ("host", "port", "timeout", "workers", "watch")
+    names = ("host", "port", "timeout", "workers", "watch", "photos")
     serve(args.map, _settings(args, queue_size=args.queue, **{name: getattr(args, name) for name in names}))
     return {}, ""
 

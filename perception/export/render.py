@@ -39,10 +39,10 @@ def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[st
 
     rgb: 8-bit PNG. depth: 16-bit PNG, thousandths of the map's unit along the optical axis, 0 = nothing. instances:
     16-bit PNG of id + 1, 0 = none. features: 8-bit PNG of the three main components.
-    cameras: a transforms.json in the coordinates of the map's input, or one of `localise`; None takes the map's held-out
-    views (all views if none were held out). A camera with lens distortion is rendered with that distortion, so that the image aligns with
-    its photo. InputError for a name that points outside `output`, and for an image
-    that would replace a photo.
+    cameras: a transforms.json in the coordinates of the map's input, or one of `localise`; None takes the map's
+    held-out views (all views if none were held out). A camera with lens distortion is rendered with that distortion, so
+    that the image aligns with its photo. InputError for a name that points outside `output`, and for an image that
+    would replace a photo.
     """
     for kind in what:
         if kind not in KINDS:

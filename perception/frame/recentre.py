@@ -41,14 +41,19 @@ def moved_scene(scene: Scene, b_from_a: np.ndarray) -> Scene:
 
 
 def moved(view: View, b_from_a: np.ndarray) -> View:
-    """The view in frame b, its depth in units of b; b_from_a [4, 4]: a similarity x_b = s R x_a + t.
-    A camera x_c = R_c x_a + t_c becomes x_c = R_c Rᵀ x_b + s t_c − R_c Rᵀ t."""
-    scale = scale_of(b_from_a)
-    pose = np.array(view.camera_from_world, np.float64)
-    pose[:3, :3] = pose[:3, :3] @ (b_from_a[:3, :3] / scale).T
-    pose[:3, 3] = scale * pose[:3, 3] - pose[:3, :3] @ b_from_a[:3, 3]
+    """The view in frame b, its depth in units of b; b_from_a [4, 4]: a similarity."""
+    pose, scale = moved_pose(view.camera_from_world, b_from_a), scale_of(b_from_a)
     depth = None if view.depth is None else replace(view.depth, scale=view.depth.scale * scale)
     return replace(view, camera_from_world=pose, depth=depth)
+
+
+def moved_pose(camera_from_a: np.ndarray, b_from_a: np.ndarray) -> np.ndarray:
+    """camera_from_b [4, 4], the camera's unit scaled with the world's; b_from_a: a similarity x_b = s R x_a + t.
+    A camera x_c = R_c x_a + t_c becomes x_c = R_c Rᵀ x_b + s t_c − R_c Rᵀ t."""
+    scale, pose = scale_of(b_from_a), np.array(camera_from_a, np.float64)
+    pose[:3, :3] = pose[:3, :3] @ (b_from_a[:3, :3] / scale).T
+    pose[:3, 3] = scale * pose[:3, 3] - pose[:3, :3] @ b_from_a[:3, 3]
+    return pose
 
 
 def map_from_input(path: Path, info: dict[str, Any]) -> np.ndarray:

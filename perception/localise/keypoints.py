@@ -22,14 +22,15 @@ TOLERANCE, TOLERANCE_SIDE = 4.0, 800
 @dataclass(frozen=True)
 class Described:
     """The features of V photos. starts [V + 1]: photo v has the features starts[v] : starts[v + 1] of `features`.
-    pixels [F, 2]. descriptors: uint8 [F, 128] of each photo. coarse: unit descriptors of the largest features of each.
-    """
+    pixels [F, 2]. descriptors: uint8 [F, 128] of each photo. coarse: unit descriptors of the largest features of all,
+    those of photo v in coarse_starts[v] : coarse_starts[v + 1]."""
 
     features: Features
     starts: np.ndarray
     pixels: np.ndarray
     descriptors: list[np.ndarray]
-    coarse: list[np.ndarray]
+    coarse: np.ndarray
+    coarse_starts: np.ndarray
 
     def matches(self, view: int, other: Described, of_other: int) -> np.ndarray:
         """Features [M, 2] that match between a photo of this and one of another set: mutual nearest neighbours."""
@@ -38,8 +39,8 @@ class Described:
 
     def votes(self, view: int, other: Described) -> np.ndarray:
         """[W] number of matches of the largest features of a photo with those of each photo of another set."""
-        similarity = self.coarse[view] @ np.concatenate(other.coarse).T
-        blocks = np.split(similarity, np.cumsum([len(each) for each in other.coarse])[:-1], axis=1)
+        similarity = self.coarse[slice(*self.coarse_starts[view : view + 2])] @ other.coarse.T
+        blocks = np.split(similarity, other.coarse_starts[1:-1], axis=1)
         return np.array([len(mutual_matches(block)) for block in blocks])
 
 
@@ -47,8 +48,8 @@ def described(features: Features, store: FeatureStore) -> Described:
     """The features that `features_of` read from `store`, with their descriptors."""
     pixels, descriptors, by_size = zip(*stored_features(store.database, store.names), strict=True)
     coarse = [unit(data[order[:COARSE_FEATURES]]) for data, order in zip(descriptors, by_size, strict=True)]
-    starts = np.cumsum([0, *map(len, descriptors)])
-    return Described(features, starts, np.concatenate(pixels), list(descriptors), coarse)
+    starts, coarse_starts = (np.cumsum([0, *map(len, each)]) for each in (descriptors, coarse))
+    return Described(features, starts, np.concatenate(pixels), list(descriptors), np.concatenate(coarse), coarse_starts)
 
 
 def tolerance(long_side: int) -> float:

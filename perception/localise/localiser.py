@@ -10,19 +10,21 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from perception.errors import InputError
+from perception.localise.evidence import doubt
 from perception.localise.joint import Adjustment, adjusted, contradicted
 from perception.localise.keypoints import described, tolerance
-from perception.localise.pose import MIN_INLIERS, Matched, find_pose
+from perception.localise.pose import GUESSED, KNOWN, LIKELY, MIN_INLIERS, Matched, find_pose
 from perception.localise.reference import Locate, Reference, open_reference
 from perception.map.map import Map
-from perception.photos.decode import photo_size, why_left_out
-from perception.photos.lens import camera_from_lens, load_pycolmap, rescale_lens, same_aspect
+from perception.photos.decode import CAMERA_FOLDER, exif_of, open_photo, photo_size, why_left_out
+from perception.photos.lens import camera_from_lens, rescale_lens, same_aspect
 from perception.photos.views import make_view, view_lens
 from perception.progress import QUIET, Progress
 from perception.sfm.database import build_features
@@ -30,11 +32,13 @@ from perception.sfm.options import ReadOptions
 from perception.sfm.tracks import features_of
 from perception.types import DepthImage, Lens, View
 
-LIKELY, MORE = 10, 60
+ALIKE, MORE = 10, 60
 """Photos of the map that a new photo is matched with: the most alike, and if they give no pose, so many more."""
 SAME_FOCAL = 0.15
 """Largest relative difference of a photo's focal length in EXIF from that of the map's camera of the same size, for the
 map's camera to be taken: EXIF states nominal values."""
+USUAL_FOCAL = 1.2
+"""Focal length of an unknown camera to start from, in long sides of the picture, as COLMAP takes it."""
 OTHER_UNIT = 1.5
 """Measured depth is scaled if it differs from that of the map's points by this factor: it has another unit."""
 
@@ -122,35 +126,42 @@ class Localiser:
         """As `localise`, with the reason for each photo that has no pose; one that cannot be read is among these."""
         unread = {n: why for n, p in enumerate(photos) if (why := why_left_out(p.photo)) is not None}
         usable = [n for n in range(len(photos)) if n not in unread]
-        found = _Search(self._reference, [photos[n] for n in usable], self._progress).run() if usable else []
+        with TemporaryDirectory(prefix="perception-localise-") as folder:
+            chosen = [photos[n] for n in usable]
+            found = _Search(self._reference, chosen, Path(folder), self._progress).run() if usable else []
         done = dict(zip(usable, found, strict=True))
         return [done[n] if n in done else NotHere(p.name, p.photo, unread[n]) for n, p in enumerate(photos)]
 
 
 class _Search:
-    """One call: some photos, all readable."""
+    """One call: some photos, all readable. folder: for their features."""
 
-    def __init__(self, reference: Reference, photos: list[NewPhoto], progress: Progress) -> None:
+    def __init__(self, reference: Reference, photos: list[NewPhoto], folder: Path, progress: Progress) -> None:
         self.reference, self.photos, self.progress = reference, photos, progress
-        lenses = [_lens_of(photo, reference.views) for photo in photos]
-        with TemporaryDirectory(prefix="perception-localise-") as folder:
-            options = ReadOptions(Path(folder), progress=progress)
-            paths = [photo.photo for photo in photos]
-            self.store = build_features(paths, [lens for lens, _ in lenses], options)
-            self.views = [_view(photo, lens) for photo, (lens, _) in zip(photos, lenses, strict=True)]
-            self.new = described(features_of(self.views, self.store), self.store)
-        self.known = [known for _, known in lenses]
+        lenses, self.trust = zip(*(_lens_of(photo, reference.views) for photo in photos), strict=True)
+        paths, options = [photo.photo for photo in photos], ReadOptions(folder, progress=progress)
+        self.store = build_features(paths, list(lenses), options)
+        self._see(lenses)
         self.most = tolerance(max(max(view.photo_size) for view in self.views))
         self.placed: dict[int, np.ndarray] = {}
         self.links: dict[int, np.ndarray] = {}
+        self.lenses: dict[int, Lens] = {}
         self.why: dict[int, str] = {}
         self.dropped = Counter[int]()
 
+    def _see(self, lenses: Sequence[Lens]) -> None:
+        """Reads the features as seen through a lens for each photo."""
+        self.views = [_view(photo, lens) for photo, lens in zip(self.photos, lenses, strict=True)]
+        self.new = described(features_of(self.views, self.store), self.store)
+
     def run(self) -> list[Localised | NotHere]:
+        """The answer for each photo."""
         candidates = {}
         for number in range(len(self.photos)):
             candidates[number] = self._alone(number)
             self.progress.update("localise: photos", number + 1, len(self.photos))
+        self._share_lenses(candidates)
+        self._use_one_unit()
         found = None
         while self.placed:
             found = adjusted(self.reference, self.new, self.placed, self._all_links(), self.most)
@@ -162,12 +173,40 @@ class _Search:
                 break
         return [self._answer(number, found) for number in range(len(self.photos))]
 
+    def _share_lenses(self, candidates: dict[int, np.ndarray]) -> None:
+        """Photos with one assumed lens were taken by one camera: all get the estimate of median focal length."""
+        shared, lenses = dict[Lens, list[Lens]](), [view_lens(view) for view in self.views]
+        for number in sorted(number for number in self.placed if self.trust[number] != KNOWN):
+            shared.setdefault(lenses[number], []).append(self.lenses[number])
+        chosen = {lens: sorted(found, key=lambda each: each.params)[len(found) // 2] for lens, found in shared.items()}
+        if all(lens == found for lens, found in chosen.items()):
+            return
+        known = [trust == KNOWN for trust in self.trust]
+        self._see([lens if sure else chosen.get(lens, lens) for lens, sure in zip(lenses, known, strict=True)])
+        self.trust = (KNOWN,) * len(lenses)
+        self.placed.clear()
+        self.links.clear()
+        for number, matches in candidates.items():
+            self._try(number, matches, self.reference.points[self.reference.point[matches[:, 1]]])
+
+    def _use_one_unit(self) -> None:
+        """Scales measured depth to the map's unit, if by the map's points it has another."""
+        links = self._all_links()
+        depth, view = self.new.features.depth[links[:, 0]], self.new.features.view[links[:, 0]]
+        rows = np.stack([self.placed.get(n, np.eye(4))[2] for n in range(len(self.photos))])[view]
+        points = self.reference.points[self.reference.point[links[:, 1]]]
+        z, known = (rows[:, :3] * points).sum(axis=1) + rows[:, 3], depth > 0
+        ratio = float(np.median(z[known] / depth[known])) if known.any() else 1.0
+        if not 1 / OTHER_UNIT < ratio < OTHER_UNIT:
+            scaled = replace(self.new.features, depth=self.new.features.depth * max(ratio, 0.0))
+            self.new = replace(self.new, features=scaled)
+
     def _alone(self, number: int) -> np.ndarray:
         """Places a photo by the map's photos alone; its matches [M, 2] with features of the map that have a point."""
         reference = self.reference
         order = np.argsort(-self.new.votes(number, reference.described), kind="stable")
         matches = np.empty((0, 2), np.int64)
-        for some in (order[:LIKELY], order[LIKELY : LIKELY + MORE]):
+        for some in (order[:ALIKE], order[ALIKE : ALIKE + MORE]):
             more = [self.new.matches(number, reference.described, view) for view in some.tolist()]
             matches = np.concatenate([matches, *more])
             matches = matches[reference.point[matches[:, 1]] >= 0]
@@ -179,11 +218,12 @@ class _Search:
     def _try(self, number: int, matches: np.ndarray, points: np.ndarray, others: int = 0) -> None:
         """Places a photo by matches [M, 2] with points [M, 3]; the last `others` are of other new photos."""
         matched = Matched(matches[:, 0], self.new.pixels[matches[:, 0]], points)
-        found = find_pose(matched, view_lens(self.views[number]), self.known[number])
+        checked = partial(doubt, self.reference, matched)
+        found = find_pose(matched, view_lens(self.views[number]), self.trust[number], checked)
         if isinstance(found, str):
             self.why[number] = found
             return
-        self.placed[number] = found.camera_from_map
+        self.placed[number], self.lenses[number] = found.camera_from_map, found.lens
         mine = matches[: len(matches) - others]
         self.links[number] = mine[found.inliers[: len(mine)]]
 
@@ -234,23 +274,31 @@ def _view(photo: NewPhoto, lens: Lens) -> View:
     return replace(make_view(photo.name, photo.photo, lens, np.eye(4), photo.photo), depth=photo.depth)
 
 
-def _lens_of(photo: NewPhoto, views: list[View]) -> tuple[Lens, bool]:
-    """The lens of a photo, and whether it is known: given; else the map's camera of the same shape, unless EXIF states
+def _lens_of(photo: NewPhoto, views: list[View]) -> tuple[Lens, float]:
+    """The lens of a photo, and how far it is trusted: given; else the map's camera of the same shape, unless EXIF has
     another focal length; else EXIF's or a usual one."""
     if photo.lens is not None:
-        return photo.lens, True
-    pycolmap = load_pycolmap()
+        return photo.lens, KNOWN
     width, height = photo_size(photo.photo)
-    exif = pycolmap.infer_camera_from_image(photo.photo)
-    stated = exif.mean_focal_length() / max(exif.width, exif.height) * max(width, height)
+    stated = _exif_focal(photo.photo, max(width, height))
     for view in views:
         lens = view_lens(view)
         if same_aspect((width, height), (lens.width, lens.height)):
             lens = rescale_lens(lens, width, height)
             focal = camera_from_lens(lens).mean_focal_length()
-            if not exif.has_prior_focal_length or abs(stated / focal - 1) <= SAME_FOCAL:
-                return lens, False
-    return Lens("SIMPLE_PINHOLE", (stated, width / 2, height / 2), width, height), False
+            if stated is None or abs(stated / focal - 1) <= SAME_FOCAL:
+                return lens, LIKELY
+    focal = USUAL_FOCAL * max(width, height) if stated is None else stated
+    return Lens("SIMPLE_RADIAL", (focal, width / 2, height / 2, 0.0), width, height), GUESSED
+
+
+def _exif_focal(photo: Path, long_side: int) -> float | None:
+    """The focal length in pixels by EXIF's for 35 mm film, whose long side is 36 mm; None where it is not stated."""
+    with open_photo(photo) as image:
+        millimetres = exif_of(image, photo, CAMERA_FOLDER).get(0xA405)
+    if isinstance(millimetres, (int, float)) and 5 <= millimetres <= 500:
+        return millimetres / 36 * long_side
+    return None
 
 
 def _finder(gmap: Map, folder: Path | None) -> Locate:

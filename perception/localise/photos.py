@@ -23,7 +23,7 @@ from perception.photos.views import fit_lens, view_lens
 from perception.progress import Progress
 from perception.sfm.options import ReadOptions
 
-_NO_POINTS = np.zeros((1, 3)), np.zeros((1, 3), np.uint8)
+NO_POINTS = np.zeros((1, 3)), np.zeros((1, 3), np.uint8)
 """A cloud for readers of posed inputs, which else triangulate one."""
 
 
@@ -38,7 +38,7 @@ def new_photos(sources: Sequence[Path], camera: Path | None, workdir: Path, prog
         elif source.suffix.lower() in VIDEO_SUFFIXES and source.is_file():
             raise InputError(f"{source}: is a video; localise takes photos, such as frames of it")
         elif (reader := reader_of(source)).poses:
-            options = ReadOptions(workdir, progress=progress, poses="keep", cloud=_NO_POINTS, lens=lens)
+            options = ReadOptions(workdir, progress=progress, poses="keep", cloud=NO_POINTS, lens=lens)
             views = reader.read(source, options).views
             found += [NewPhoto(view.name, view.photo, view_lens(view), view.depth) for view in views]
         elif photos := list_photos(source):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,12 +16,14 @@ MIN_INLIERS = 20
 MIN_SPREAD = 0.02
 """Least share of the picture that the agreeing features cover: the ellipse of two standard deviations. Fewer leave the
 pose loose, and are as likely a picture within the picture."""
+SEARCHES = 3
 EQUAL = 0.7
-"""A second pose with this share of the features of the first makes both doubtful: equal textures in two spots."""
+"""Most searches for poses of one photo. A second pose makes the first doubtful if it explains this share as many
+features that the first does not, as the other way round: equal textures in two spots, or a thing that was moved."""
 SAME_ANGLE, SAME_SHARE = 3.0, 0.05
 """Poses are the same if they differ by less than this angle in degrees and this share of the distance to the points."""
-GROWN = 1.15
-"""An assumed lens is replaced by an estimated one if that makes this many times as many features agree."""
+KNOWN, LIKELY, GUESSED = np.inf, 1.15, 1.0
+"""How far a lens is trusted: an estimated one replaces it if that makes this many times as many features agree."""
 
 
 @dataclass(frozen=True)
@@ -41,53 +44,58 @@ class Matched:
     pixel: np.ndarray
     point: np.ndarray
 
-    def part(self, mask: np.ndarray) -> Matched:
-        return Matched(self.feature[mask], self.pixel[mask], self.point[mask])
 
-
-def find_pose(matched: Matched, lens: Lens, known: bool) -> Pose | str:
-    """The verified pose of a photo, else why there is none, one line. known: the lens is not to be estimated.
-    Ambiguity: the search is repeated without the matches of the first pose; an equal texture elsewhere then wins."""
-    best = _ransac(matched, lens, known)
-    if best is None or best.count < MIN_INLIERS:
-        found = 0 if best is None else best.count
-        return f"{found} features agree with one pose, {MIN_INLIERS} are needed"
-    covered = _spread(matched.pixel[best.inliers], lens)
-    if covered < MIN_SPREAD:
-        return f"the {best.count} features that agree with one pose cover {covered:.1%} of the picture"
-    rest = matched.part(~best.inliers)
-    other = _ransac(rest, best.lens, known=True)
-    if other is not None and other.count >= EQUAL * best.count and not _same(best, other, matched.point[best.inliers]):
-        return f"two poses fit equally well ({best.count} and {other.count} features): equal textures in two spots"
+def find_pose(matched: Matched, lens: Lens, trust: float, doubt: Callable[[Pose], str | None]) -> Pose | str:
+    """The verified pose of a photo, else why there is none, one line. trust: in the lens (KNOWN, LIKELY, GUESSED).
+    doubt: further checks of a pose. The search is repeated without the matches of the poses before: the thing or
+    texture that a pose rests on may be elsewhere now, or in two spots; then no pose is right for sure."""
+    found, whys, rest = list[Pose](), list[str](), np.ones(len(matched.feature), bool)
+    for _ in range(SEARCHES):
+        pose = _ransac(matched, rest, lens, trust)
+        count = 0 if pose is None else pose.count
+        if pose is None or count < MIN_INLIERS:
+            whys.append(f"{count} features agree with one pose, {MIN_INLIERS} are needed")
+            break
+        rest &= ~pose.inliers
+        if (covered := _spread(matched.pixel[pose.inliers], lens)) < MIN_SPREAD:
+            whys.append(f"the {count} features that agree with one pose cover {covered:.1%} of the picture")
+        elif (why := doubt(pose)) is not None:
+            whys.append(why)
+        elif not any(_same(pose, other, matched.point[pose.inliers]) for other in found):
+            found.append(pose)
+    if not found:
+        return whys[0]
+    best, *others = sorted(found, key=lambda pose: -pose.count)
+    for other in others:
+        own, its = (set(matched.feature[pose.inliers].tolist()) for pose in (best, other))
+        if len(own - its) < MIN_INLIERS or len(its - own) >= EQUAL * len(own - its):
+            return f"two poses fit ({best.count} and {other.count} features): equal textures in two spots"
     return best
 
 
-def _ransac(matched: Matched, lens: Lens, known: bool) -> Pose | None:
-    """The pose that most matches agree with, refined by them; None if none is found."""
-    fixed = _estimated(matched, lens, free=False)
-    if known:
-        return fixed
-    free = _estimated(matched, lens, free=True)
-    if fixed is None or (free is not None and free.count > GROWN * fixed.count):
-        return free
-    return fixed
+def _ransac(matched: Matched, used: np.ndarray, lens: Lens, trust: float) -> Pose | None:
+    """The pose that most of the `used` matches agree with, refined by them; None if none is found."""
+    fixed = _estimated(matched, used, lens, free=False)
+    free = None if trust == KNOWN else _estimated(matched, used, lens, free=True)
+    return free if free is not None and (fixed is None or free.count >= trust * fixed.count) else fixed
 
 
-def _estimated(matched: Matched, lens: Lens, free: bool) -> Pose | None:
-    if len(matched.feature) < 4:
+def _estimated(matched: Matched, used: np.ndarray, lens: Lens, free: bool) -> Pose | None:
+    if used.sum() < MIN_INLIERS:
         return None
     pycolmap, camera = load_pycolmap(), camera_from_lens(lens)
     estimation, refinement = pycolmap.AbsolutePoseEstimationOptions(), pycolmap.AbsolutePoseRefinementOptions()
     estimation.ransac.max_error = most = tolerance(max(lens.width, lens.height))
     estimation.ransac.random_seed = 0
-    estimation.estimate_focal_length = refinement.refine_focal_length = free
-    found = pycolmap.estimate_and_refine_absolute_pose(matched.pixel, matched.point, camera, estimation, refinement)
-    if found is None:
+    estimation.estimate_focal_length = refinement.refine_focal_length = refinement.refine_extra_params = free
+    pixel, point = matched.pixel[used], matched.point[used]
+    found = pycolmap.estimate_and_refine_absolute_pose(pixel, point, camera, estimation, refinement)
+    if found is None or not np.isfinite(camera.params).all() or camera.mean_focal_length() <= 0:
         return None
     pose = np.vstack([found["cam_from_world"].matrix(), [0, 0, 0, 1]])
     x = matched.point @ pose[:3, :3].T + pose[:3, 3]
-    pixel = np.asarray(camera.img_from_cam(x), np.float64).reshape(-1, 2)
-    good = (x[:, 2] > 0) & (np.linalg.norm(pixel - matched.pixel, axis=1) <= most)
+    projected = np.asarray(camera.img_from_cam(x), np.float64).reshape(-1, 2)
+    good = (x[:, 2] > 0) & (np.linalg.norm(projected - matched.pixel, axis=1) <= most)
     return Pose(pose, good, len(np.unique(matched.feature[good])), lens_from_camera(camera))
 
 

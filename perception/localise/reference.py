@@ -95,6 +95,13 @@ def _rendered(gmap: Map, view: View, file: Path) -> View:
     width, height = scaled_size(view, gmap.setting("photos", "max_side", MAX_SIDE))
     K = scaled_K(view, width, height)
     pose, camera = (torch.from_numpy(np.asarray(matrix, np.float32)) for matrix in (view.camera_from_world, K))
-    picture = rgb_image(as_gaussians(gmap), pose, camera, width, height)
-    cv2.imwrite(str(file), np.ascontiguousarray(picture[..., ::-1]))
+    write_rgb(file, rgb_image(as_gaussians(gmap), pose, camera, width, height))
     return View(view.name, file, K, width, height, view.camera_from_world)
+
+
+def write_rgb(file: Path, picture: np.ndarray) -> Path:
+    """Writes [h, w, 3] uint8 RGB as PNG. InputError for another array."""
+    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or picture.size == 0:
+        raise InputError(f"photo: found {picture.dtype} {list(picture.shape)}, expected uint8 [h, w, 3] RGB")
+    file.write_bytes(cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))[1].tobytes())
+    return file

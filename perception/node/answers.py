@@ -45,7 +45,15 @@ QUERY = Channel("query", "rcl_interfaces/srv/GetParameters")
 """The standard service type that takes texts and returns typed values: each name is a prompt, each value its answer."""
 RELOAD = Channel("reload", "std_srvs/srv/Trigger")
 
-OUTPUTS = (ANSWER, POINTS, BOXES, MARKS, MAP_CLOUD, HEALTH)
+LOCALISE_IMAGE = Channel("localise/image", "sensor_msgs/msg/Image")
+LOCALISE_COMPRESSED = Channel("localise/image/compressed", "sensor_msgs/msg/CompressedImage")
+LOCALISE_CAMERA = Channel("localise/camera_info", "sensor_msgs/msg/CameraInfo")
+"""Input: images to be localised, and their intrinsics if known."""
+LOCALISE_POSE = Channel("localise/pose", "geometry_msgs/msg/PoseWithCovarianceStamped")
+LOCALISE_ANSWER = Channel("localise/answer", "std_msgs/msg/String")
+"""Output, with the image's stamp: the camera's pose in the map's frame; JSON, also of an image that has no pose."""
+
+OUTPUTS = (ANSWER, POINTS, BOXES, MARKS, MAP_CLOUD, HEALTH, LOCALISE_POSE, LOCALISE_ANSWER)
 
 DEPTH = 64
 """Largest number of messages queued for a slow reader; older ones are dropped, which bounds the memory."""

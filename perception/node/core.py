@@ -18,6 +18,7 @@ from typing import Any, Protocol
 from perception.errors import InputError
 from perception.node import answers
 from perception.node.config import NodeConfig
+from perception.node.localise import Localising
 from perception.query import QueryMap
 from perception.serve.bodies import QueryBody, parse
 from perception.serve.engine import QueryEngine
@@ -99,6 +100,7 @@ class Core:
         self._stamps = _Stamps()
         self._refused: Counter[str] = Counter()
         self._sending_map = threading.Lock()
+        self.localising = Localising(engine, transport, config)
         engine.on_reload(lambda _: self._submit(self._send_map))
 
     def start(self) -> None:
@@ -195,7 +197,8 @@ class Core:
     def send_health(self) -> None:
         """Publishes the health message: figures of the engine, counts of rejected prompts, transport warnings."""
         refused = {f"refused_{kind}": count for kind, count in self._refused.items()}
-        facts = {**self._engine.health(), **refused, **self._transport.figures()}
+        dropped = {"images_dropped": self.localising.dropped} if self.localising.dropped else {}
+        facts = {**self._engine.health(), **refused, **dropped, **self._transport.figures()}
         body = answers.diagnostics(self._config.namespace, facts, self._transport.warnings(), self._stamps.next())
         self._transport.publish(answers.HEALTH, body)
 

@@ -80,13 +80,15 @@ class RosTransport:
         from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 
         calls, node = ReentrantCallbackGroup(), self._node
-        node.create_subscription(
-            message_class(answers.PROMPT.kind),
-            answers.PROMPT.name,
-            lambda message: core.prompt(message.data),
-            _qos(False),
-            callback_group=MutuallyExclusiveCallbackGroup(),
-        )
+        topics: dict[Channel, Callable[[Any], None]] = {
+            answers.PROMPT: lambda message: core.prompt(message.data),
+            answers.LOCALISE_IMAGE: core.localising.image,
+            answers.LOCALISE_COMPRESSED: core.localising.image,
+            answers.LOCALISE_CAMERA: core.localising.camera,
+        }
+        for topic, take in topics.items():
+            group = MutuallyExclusiveCallbackGroup()
+            node.create_subscription(message_class(topic.kind), topic.name, take, _qos(False), callback_group=group)
         services: dict[Channel, Callable[[Any, Any], Any]] = {
             answers.QUERY: lambda request, response: self._query(core, request, response),
             answers.RELOAD: lambda _, response: fill(response, core.reload()),

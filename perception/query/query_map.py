@@ -4,8 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+<<<<<<< HEAD
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
+=======
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+>>>>>>> w-localise
 
 import numpy as np
 
@@ -23,9 +30,10 @@ from perception.query.requests import MAX_TOP, TOP, UnknownInstance, check_promp
 from perception.query.spatial_index import SpatialIndex
 from perception.query.text_ranking import Encoders, TextRanking
 from perception.query.where import Frame, Where, position_of, tidy
-from perception.types import OrientedBox, View
+from perception.types import DepthImage, Lens, OrientedBox, View
 
 if TYPE_CHECKING:
+    from perception.localise.localiser import Localised, Localiser
     from perception.query.free_space import FreeSpace
 
 _NEIGHBORS = 3
@@ -265,6 +273,25 @@ class QueryMap(Map):
                 raise UnknownInstance(f"instance {instance_id}: {when} (last seen: {last_seen(known, self._visit)})")
             raise UnknownInstance(f"instance {instance_id}: the map has none such; it has {len(self.instances)}")
         return position
+
+    def localise(
+        self, photo: str | Path | np.ndarray, lens: Lens | None = None, depth: DepthImage | None = None
+    ) -> Localised | None:
+        """The pose of a new photo, a file or [H, W, 3] uint8 RGB, in the map's own frame; None where it is not in this
+        map (see `Localiser`). lens: if known; depth: scale in the map's unit. The first call reads the map's photos."""
+        if isinstance(photo, np.ndarray):
+            from perception.localise.reference import write_rgb
+
+            with TemporaryDirectory(prefix="perception-localise-") as folder:
+                return self.localise(write_rgb(Path(folder) / "photo.png", photo), lens, depth)
+        return self.localiser.localise([Path(photo)], lens, [depth])[0]
+
+    @cached_property
+    def localiser(self) -> Localiser:
+        """Localises photos, also many together, which is more exact; it holds the features of the map's photos."""
+        from perception.localise.localiser import Localiser
+
+        return Localiser(self)
 
     def best_view(self, instance_id: int) -> tuple[View, tuple[int, int, int, int]] | None:
         """The view that shows the instance best and the tight box (x0, y0, x1, y1) in it, in pixels of the size used

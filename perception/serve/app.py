@@ -19,6 +19,7 @@ from perception.query import Frame, Hit, QueryMap
 from perception.serve.bodies import AtBody, FindBody, NearestBody, QueryBody
 from perception.serve.engine import QueryEngine
 from perception.serve.guard import HANDLERS, HttpGuard
+from perception.serve.localise import LocaliseBody
 from perception.serve.requests import ServeSettings, source
 
 FORMATS = {"npz": "application/x-npz", "ply": "application/octet-stream"}
@@ -68,6 +69,7 @@ def build_app(engine: QueryEngine, settings: ServeSettings) -> FastAPI:
     add_state(app, engine)
     add_searches(app, MapQueries(engine))
     add_instances(app, MapQueries(engine))
+    add_localising(app, MapQueries(engine), settings)
     return app
 
 
@@ -90,6 +92,20 @@ class MapQueries:
             return {"hits": [hit.to_json() for hit in work(gmap)], **source(gmap, frame)}
 
         return JSONResponse(await self.result(map_id, answer))
+
+
+def add_localising(app: FastAPI, queries: MapQueries, settings: ServeSettings) -> None:
+    """The route that tells where a picture was taken."""
+
+    @app.post("/localise")
+    async def localise(body: LocaliseBody, map_id: MapId = None) -> Response:
+        """The pose of a picture's camera, with its standard error; or why it is not in this map."""
+        frame = body.query_frame()
+
+        def work(gmap: QueryMap) -> dict[str, Any]:
+            return {**body.answered(gmap, settings.photos), **source(gmap, frame)}
+
+        return JSONResponse(await queries.result(map_id, work))
 
 
 def add_state(app: FastAPI, engine: QueryEngine) -> None:

@@ -17,7 +17,7 @@ from starlette.exceptions import HTTPException
 
 from perception.serve.bodies import problem_line
 from perception.serve.listening import Guard
-from perception.serve.requests import KINDS, ServeSettings, error_kind, error_line
+from perception.serve.requests import KINDS, MAX_PICTURE, ServeSettings, error_kind, error_line
 
 _log = logging.getLogger("perception.serve")
 _STATUS = {"unknown_instance": 404, "other_map": 409, "busy": 503, "closed": 503, "timeout": 504}
@@ -65,7 +65,9 @@ HANDLERS: dict[Any, Any] = dict.fromkeys((RequestValidationError, *KINDS, HTTPEx
 
 OPEN = {"/openapi.json", "/health"}
 """Paths that need no token; without one, /health returns its status only."""
-_MAX_DROPPED = 8 << 20
+LARGER = {"/localise": MAX_PICTURE, "/mcp": MAX_PICTURE}
+"""Paths whose requests hold pictures, and their largest."""
+_MAX_DROPPED = MAX_PICTURE
 _HEADERS = [
     (b"x-content-type-options", b"nosniff"),
     (b"cache-control", b"no-store"),
@@ -95,7 +97,8 @@ class HttpGuard:
         scope.setdefault("state", {})["trusted"] = trusted
         refusal = self._refusal(scope, headers, trusted)
         if refusal is None and scope["method"] in ("POST", "PUT", "PATCH"):
-            refusal, receive = await self._body(receive)
+            most = max(self.settings.max_body, LARGER.get(scope["path"], 0))
+            refusal, receive = await self._body(receive, most)
         if refusal is not None:
             await refusal(scope, receive, _with_headers(send))
             return
@@ -114,13 +117,13 @@ class HttpGuard:
             return problem(415, f"Content-Type is '{found}', expected application/json")
         return None
 
-    async def _body(self, receive: Any) -> tuple[Any, Any]:
+    async def _body(self, receive: Any, most: int) -> tuple[Any, Any]:
         """Reads the body within its limits; (rejection, receive) or (None, a receive that returns the body again).
 
         An oversized body is read and dropped up to _MAX_DROPPED bytes, because a client that is still sending when the
         connection closes does not receive the response.
         """
-        most, kept, size = self.settings.max_body, bytearray(), 0
+        kept, size = bytearray(), 0
         deadline = time.monotonic() + self.settings.timeout
         more = True
         while more and size <= _MAX_DROPPED:

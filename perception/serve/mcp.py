@@ -31,7 +31,8 @@ from perception.query.robot_pose import where_to_stand
 from perception.query.scene_graph import scene_graph
 from perception.serve.bodies import AnyRegion, Body, FrameBody, Length, PointOrPose, Prompt, Text, parse
 from perception.serve.engine import QueryEngine
-from perception.serve.requests import NoScale, ServeSettings, UnknownFrame, error_kind, error_line, source
+from perception.serve.localise import GivenPhoto, Place
+from perception.serve.requests import MAX_PICTURE, NoScale, ServeSettings, UnknownFrame, error_kind, error_line, source
 from perception.serve.server import serve
 
 try:
@@ -108,6 +109,9 @@ class PoseAnswer(Answer):
     pose: list[list[float]] = Field(description="[4, 4] frame_from_robot: origin on the floor, x to the instance, z up")
     distance: float = Field(description="level, from the position to the nearest point")
     seen: float = Field(description="share of the lines of sight that nothing blocks")
+
+
+class LocaliseAnswer(Answer, Place): ...
 
 
 class Tool(Body):
@@ -237,7 +241,16 @@ class WhereToStand(Tool):
         return {**pose, "distance": gap, "seen": robot.seen, "confidence": score}
 
 
-TOOLS: dict[str, type[Tool]] = {"find": Find, "list_objects": ListObjects, "describe": Describe}
+class Localise(Tool, GivenPhoto):
+    """Where a photo was taken: the pose of its camera with standard errors, or why it is not in this map."""
+
+    answer = LocaliseAnswer
+
+    def fields_of(self, gmap: QueryMap, frame: Frame | None, photos: Path | None) -> dict[str, Any]:
+        return {**self.place(gmap, frame, photos), "confidence": None}
+
+
+TOOLS: dict[str, type[Tool]] = {"localise": Localise, "find": Find, "list_objects": ListObjects, "describe": Describe}
 TOOLS |= {"nearest": Nearest, "where_to_stand": WhereToStand, "measure": Measure}
 
 
@@ -340,7 +353,7 @@ def serve_http(path: Path, settings: ServeSettings, encoders: Any = None, photos
 
     def build(engine: QueryEngine, settings: ServeSettings) -> Any:
         server, host = make_server(engine, photos), settings.host
-        app = server.streamable_http_app(stateless_http=True, max_request_body_size=settings.max_body, host=host)
+        app = server.streamable_http_app(stateless_http=True, max_request_body_size=MAX_PICTURE, host=host)
         app.add_middleware(HttpGuard, settings=settings)
         return app
 

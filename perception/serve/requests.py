@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from pydantic import Field
@@ -17,6 +18,8 @@ from perception.query.requests import TOP, UnknownInstance, check_prompt
 MAX_TEXTS = 32
 MAX_BYTES = 64 << 10
 """Largest request in bytes, JSON included; larger ones are rejected before parsing."""
+MAX_PICTURE = 8 << 20
+"""Largest request with a picture in it, which base64 makes a third longer."""
 
 
 class EngineSettings(Settings):
@@ -38,7 +41,8 @@ class ServeSettings(EngineSettings):
     host: str = Field("127.0.0.1", description="where to listen")
     port: int = Field(8765, ge=0, le=65535, description="0: any free one")
     token: str | None = Field(None, description="clients send it as a bearer token; none only on this machine")
-    max_body: int = Field(MAX_BYTES, ge=1, description="bytes of a request")
+    max_body: int = Field(MAX_BYTES, ge=1, description="bytes of a request without a picture")
+    photos: Path | None = Field(None, description="folder where the map's photos may be read beside its own")
 
 
 class OtherMap(InputError):

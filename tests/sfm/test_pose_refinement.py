@@ -140,7 +140,9 @@ def test_jacobians_are_finite_differences():
     features = seen(rng, matrices, wrong=0)
     tracks, poses = tracks_of(features, features.pairs[:50]), poses_of(views_at(matrices))
     points = starting_points(tracks, poses)
-    problem = _Problem(tracks, poses, None, np.empty(0), 1e6, 1e6)  # noise so large that the robust weights are 1
+    problem = _Problem(
+        tracks, poses, None, np.empty(0), 1e6, 1e6, np.zeros(len(poses.center), bool)
+    )  # noise so large that the robust weights are 1
 
     def residual(delta, shift):
         moved = _linearised(problem, poses.turned(delta), points + shift)[0]

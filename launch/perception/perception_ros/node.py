@@ -40,6 +40,7 @@ CELL = 0.05  # side of a cell of the floor plan, metres
 TEXTS = {
     "map": "the map directory",
     "frame_file": "frame.yaml, where the map lies in the robot's world; empty: no transform is published",
+    "photos": "folder where the map's photos may be read beside its own, to localise images",
 }
 SETTINGS = ("workers", "queue_size", "timeout", "map_points", "watch", "discovery_seconds")
 SWITCHES = {"autostart": "whether the node configures and activates itself"}
@@ -161,6 +162,7 @@ class MapNode(LifecycleNode):
         self._frames = read_frame(Path(texts["frame_file"])) if texts["frame_file"] else None
         engine = PlacedEngine(Path(texts["map"]), self._frames, encoders=self._encoders, **config.of_engine())
         self.config = self._transport.config = config
+        self._core.localising.photos = Path(texts["photos"]) if texts["photos"] else None
         self._gate.hold(engine)
         held = engine.current
         unit = "in metres" if held.metric else "in the unit of its reconstruction, not metres; frame_file can scale it"

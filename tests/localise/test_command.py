@@ -1,0 +1,153 @@
+"""`perception localise` on a small map: its answers, its file, and one line for what it cannot use."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import perception
+from perception.cli import main
+from perception.inputs.transforms import in_map_frame, lens_values, read_frames
+from perception.map.files import MapFiles
+from perception.map.write import read_map, write_map
+from perception.photos.lens import camera_from_lens
+from perception.types import Lens
+from support.painted_room import PaintedRoom, difference, walk, write_room_map
+
+TRUTH = walk(1, 4, 0.15)[1:3]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map, its photos, new ones of the same room and of another."""
+    folder = tmp_path_factory.mktemp("command")
+    room, other = PaintedRoom(0), PaintedRoom(5)
+    write_room_map(folder / "a.gsmap", room, walk(1, 5), folder / "photos")
+    for n, pose in enumerate(TRUTH):
+        room.view(folder / "new", f"{n}.png", pose)
+    other.view(folder / "other", "elsewhere.png", TRUTH[0])
+    return folder
+
+
+def told(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
+    assert main(["localise", *map(str, arguments), "--json"]) == 0
+    return dict(json.loads(capsys.readouterr().out))
+
+
+def test_poses_as_json_and_as_a_file_in_the_maps_frame(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    facts = told(capsys, folder / "a.gsmap", folder / "new", folder / "other/elsewhere.png", "-o", folder / "out.json")
+    assert [(photo["name"], photo["localised"]) for photo in facts["photos"]] == [
+        ("0.png", True), ("1.png", True), ("elsewhere.png", False),
+    ]  # fmt: skip
+    assert (facts["frame"], facts["metric"], facts["rendered"]) == ("map", True, [])
+    frames = read_frames(folder / "out.json")
+    assert in_map_frame(folder / "out.json") and [name for name, _, _ in frames] == ["new/0.png", "new/1.png"]
+    for photo, (_, pose, lens), truth in zip(facts["photos"], frames, TRUTH, strict=False):
+        assert np.allclose(pose, photo["camera_from_map"]) and lens.params[0] == 300
+        assert difference(pose, truth)[0] < 0.003
+        assert np.allclose(photo["position"], np.linalg.inv(truth)[:3, 3], atol=0.003)
+
+
+def test_a_photo_of_the_map_itself_from_python(folder: Path) -> None:
+    gmap = perception.load_map(folder / "a.gsmap")
+    picture = cv2.imread(str(folder / "new/0.png"))[..., ::-1]
+    found = gmap.localise(picture)
+    assert found is not None and difference(found.camera_from_map, TRUTH[0])[0] < 0.003
+    assert gmap.localise(folder / "other/elsewhere.png") is None
+    with pytest.raises(perception.InputError, match="expected uint8"):
+        gmap.localise(picture[..., 0])
+    with pytest.raises(perception.InputError, match="no such photo"):
+        gmap.localise(folder / "nothing.png")
+
+
+def test_a_map_whose_photos_are_gone_is_rendered_and_their_new_folder_is_taken(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    moved = tmp_path / "moved"
+    shutil.copytree(folder / "a.gsmap", tmp_path / "a.gsmap")
+    gmap = read_map(tmp_path / "a.gsmap")
+    gmap.views = [replace(view, photo=tmp_path / view.name, photo_beside=None) for view in gmap.views]  # type: ignore[call-arg]
+    write_map(tmp_path / "a.gsmap", gmap)
+    shutil.copytree(folder / "photos", moved)
+    facts = told(capsys, tmp_path / "a.gsmap", folder / "new/0.png", "--photos", moved)
+    assert facts["rendered"] == [] and facts["photos"][0]["localised"]
+    (moved / "0.png").write_bytes(b"another file of that name")
+    facts = told(capsys, tmp_path / "a.gsmap", folder / "new/0.png", "--photos", moved)
+    assert facts["rendered"] == ["0.png"] and facts["photos"][0]["localised"]
+    assert main(["localise", str(tmp_path / "a.gsmap"), str(folder / "new/0.png")]) == 2  # balls look like no wall
+    assert "0.png: not in this map" in capsys.readouterr().err
+
+
+def test_what_cannot_be_used_is_told_in_one_line(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = MapFiles(folder / "a.gsmap").map_id
+    (tmp_path / "broken.png").write_bytes(b"no picture")
+    (tmp_path / "video.mp4").write_bytes(b"")
+    (tmp_path / "empty").mkdir()
+    photo = folder / "new/0.png"
+    for arguments, word in (
+        ([folder / "other"], "elsewhere.png: not in this map"),
+        ([tmp_path / "broken.png"], "broken.png"),
+        ([tmp_path / "nothing.png"], "no such file"),
+        ([tmp_path / "video.mp4"], "is a video"),
+        ([tmp_path / "empty"], "no photos found"),
+        ([photo, "-o", photo], "write to another file"),
+        ([photo, "-o", folder / "photos/0.png"], "write to another file"),
+        ([photo, "--photos", tmp_path / "nowhere"], "is no folder"),
+        ([photo, "--camera", tmp_path / "nowhere.yaml"], "nowhere.yaml"),
+    ):
+        assert main(["localise", str(folder / "a.gsmap"), *map(str, arguments)]) == 2
+        lines = capsys.readouterr().err.strip().splitlines()
+        assert word in lines[-1] and lines[-1].startswith("error: ")
+    assert MapFiles(folder / "a.gsmap").map_id == before
+    assert main(["localise", str(folder / "a.gsmap"), str(folder / "other"), "--json"]) == 2
+    assert json.loads(capsys.readouterr().out)["photos"][0]["localised"] is False
+
+
+def test_rendering_takes_such_a_file_as_in_the_maps_frame(folder: Path, tmp_path: Path) -> None:
+    """The map's frame lies a kilometre from that of its input, whose cameras are moved there."""
+    gmap = read_map(folder / "a.gsmap")
+    far = np.eye(4)
+    far[0, 3] = 1000.0
+    gmap.info["map_from_input"] = far.tolist()
+    write_map(tmp_path / "a.gsmap", gmap)
+    frame = {"file_path": "a.png", **lens_values(Lens("PINHOLE", (150.0, 150.0, 100.0, 75.0), 200, 150))}
+    frame["transform_matrix"] = (np.linalg.inv(TRUTH[0]) @ np.diag([1.0, -1, -1, 1])).tolist()
+    for name, head in (("of_map", {"map_id": gmap.map_id}), ("of_input", {})):
+        (tmp_path / f"{name}.json").write_text(json.dumps({**head, "frames": [frame]}))
+        arguments = ["--cameras", str(tmp_path / f"{name}.json"), "-o", str(tmp_path / name)]
+        assert main(["render", str(tmp_path / "a.gsmap"), *arguments]) == 0
+    seen = {name: cv2.imread(str(tmp_path / name / "a.png")).max() for name in ("of_map", "of_input")}
+    assert seen["of_map"] > 100 and seen["of_input"] == 0
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_PINHOLE", (300.0, 200.0, 150.0)),
+        ("SIMPLE_RADIAL", (300.0, 200.0, 150.0, 0.05)),
+        ("OPENCV", (300.0, 310.0, 200.0, 150.0, 0.05, -0.02, 0.001, 0.002)),
+        ("FULL_OPENCV", (300.0, 310.0, 200.0, 150.0, 0.05, -0.02, 0.001, 0.002, 0.01, 0.02, 0.0, 0.0)),
+        ("SIMPLE_RADIAL_FISHEYE", (300.0, 200.0, 150.0, 0.05)),
+    ],
+)
+def test_every_lens_is_written_so_that_it_sees_the_same(model: str, params: tuple[float, ...], tmp_path: Path) -> None:
+    lens = Lens(model, params, 400, 300)
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), **lens_values(lens)}
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+    back = read_frames(tmp_path / "transforms.json")[0][2]
+    rays = np.array([[0.0, 0, 1], [0.3, -0.2, 1], [-0.5, 0.4, 1]])
+    assert np.allclose(camera_from_lens(back).img_from_cam(rays), camera_from_lens(lens).img_from_cam(rays))
+
+
+def test_a_lens_without_keys_is_refused() -> None:
+    with pytest.raises(perception.InputError, match="FOV cannot be written"):
+        lens_values(Lens("FOV", (300.0, 300.0, 200.0, 150.0, 0.5), 400, 300))

@@ -1,0 +1,94 @@
+"""Poses from made matches with exact truth: right ones are found, doubtful ones refused with the reason."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from perception.localise.pose import GUESSED, KNOWN, MIN_INLIERS, Matched, Pose, find_pose
+from perception.types import Lens
+from support.painted_room import difference, pose_at
+
+LENS = Lens("PINHOLE", (500.0, 500.0, 320.0, 240.0), 640, 480)
+POSE = pose_at((0.2, -4.0, 0.3), (0.0, 0.0, 0.0))
+OTHER = pose_at((3.0, -3.0, 0.8), (0.2, 0.1, 0.0))
+
+
+def seen(pose: np.ndarray, points: np.ndarray, lens: Lens = LENS) -> np.ndarray:
+    x = points @ pose[:3, :3].T + pose[:3, 3]
+    fx, fy, cx, cy = lens.params
+    return np.asarray(x[:, :2] / x[:, 2:] * (fx, fy) + (cx, cy))
+
+
+def matches(*parts: tuple[np.ndarray, int], noise: float = 0.3, lens: Lens = LENS, side: float = 1.0) -> Matched:
+    """For each part (pose, count): other features at points of a cube of this side, and 100 wrong matches."""
+    rng = np.random.default_rng(0)
+    pixels, points = [], []
+    for pose, count in parts:
+        x = rng.uniform(-side, side, (count, 3))
+        points.append(x)
+        pixels.append(seen(pose, x, lens) + rng.normal(scale=noise, size=(count, 2)))
+    points.append(rng.uniform(-1, 1, (100, 3)))
+    pixels.append(rng.uniform((0, 0), (lens.width, lens.height), (100, 2)))
+    pixel, point = np.concatenate(pixels), np.concatenate(points)
+    return Matched(np.arange(len(pixel)), pixel, point)
+
+
+def sure(_: Pose) -> None:
+    """No further doubts."""
+
+
+def test_the_pose_is_found_among_wrong_matches() -> None:
+    found = find_pose(matches((POSE, 200)), LENS, KNOWN, sure)
+    assert isinstance(found, Pose)
+    length, degrees = difference(found.camera_from_map, POSE)
+    assert length < 0.01 and degrees < 0.1
+    assert found.count >= 195 and found.inliers[:200].sum() >= 195 and found.inliers[200:].sum() <= 2
+
+
+def test_a_thing_that_was_moved_does_not_decide_but_an_equal_share_is_doubtful() -> None:
+    found = find_pose(matches((POSE, 200), (OTHER, 90)), LENS, KNOWN, sure)
+    assert isinstance(found, Pose) and difference(found.camera_from_map, POSE)[0] < 0.01
+    refused = find_pose(matches((POSE, 200), (OTHER, 180)), LENS, KNOWN, sure)
+    assert isinstance(refused, str) and "two poses fit" in refused
+
+
+def test_the_same_features_at_two_spots_are_doubtful() -> None:
+    """Each feature matches two points, which agree with two poses, and a few more features with the first only."""
+    one, other = (matches((pose, 150)) for pose in (POSE, OTHER))
+    both = Matched(
+        np.concatenate([one.feature, np.arange(150)]),
+        np.concatenate([one.pixel, one.pixel[:150]]),
+        np.concatenate([one.point, _carried(one.pixel[:150], other.point[:150])]),
+    )
+    refused = find_pose(both, LENS, KNOWN, sure)
+    assert isinstance(refused, str) and "two poses fit" in refused
+
+
+def _carried(pixel: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points that OTHER sees at `pixel`, as far away as `points` are."""
+    depth = (points @ OTHER[:3, :3].T + OTHER[:3, 3])[:, 2:]
+    rays = np.c_[(pixel - (320, 240)) / 500, np.ones(len(pixel))]
+    return np.asarray((rays * depth - OTHER[:3, 3]) @ OTHER[:3, :3])
+
+
+def test_few_or_crowded_features_give_no_pose() -> None:
+    few = find_pose(matches((POSE, MIN_INLIERS - 5)), LENS, KNOWN, sure)
+    assert isinstance(few, str) and f"{MIN_INLIERS} are needed" in few
+    crowded = find_pose(matches((POSE, 150), side=0.05), LENS, KNOWN, sure)
+    assert isinstance(crowded, str) and "of the picture" in crowded
+
+
+def test_a_doubted_pose_leaves_room_for_the_next() -> None:
+    found = find_pose(matches((POSE, 200), (OTHER, 90)), LENS, KNOWN, lambda pose: "no" if pose.count > 150 else None)
+    assert isinstance(found, Pose) and difference(found.camera_from_map, OTHER)[0] < 0.03
+
+
+@pytest.mark.parametrize("focal", [350.0, 700.0])
+def test_a_guessed_lens_is_estimated(focal: float) -> None:
+    true = Lens("PINHOLE", (focal, focal, 320.0, 240.0), 640, 480)
+    guess = Lens("SIMPLE_RADIAL", (500.0, 320.0, 240.0, 0.0), 640, 480)
+    found = find_pose(matches((POSE, 200), lens=true), guess, GUESSED, sure)
+    assert isinstance(found, Pose)
+    assert found.lens.params[0] == pytest.approx(focal, rel=0.02)
+    assert difference(found.camera_from_map, POSE)[0] < 0.1
