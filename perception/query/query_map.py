@@ -4,15 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-<<<<<<< HEAD
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any
-=======
-from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
->>>>>>> w-localise
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
