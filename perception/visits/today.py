@@ -23,6 +23,7 @@ from perception.visits.growth import (
     trained,
     update_config,
 )
+from perception.visits.look import Look
 from perception.visits.motion import (
     ALIKE,
     CERTAIN,
@@ -45,9 +46,10 @@ UP = (0.0, 0.0, 1.0)
 
 @dataclass
 class Today:
-    """What stands where today: the Gaussians, of which the first rows are the rows `kept` [H] of the map; ids
-    [N] int32 instance, `membership` [N], part_ids [N]; signs of the map's instances, in their order; `gone`: ids of
-    those that do not stand where they stood; motions by id; `added`: scores of the new ones, by id."""
+    """What stands where today: the Gaussians, of which the first rows are the rows `kept` [H] of the map; ids [N] int32
+    instance, `membership` [N], part_ids [N]; signs of the map's instances, in their order; `gone`: ids of those that do
+    not stand where they stood; motions by id; `added`: of the new ones, by id, the score and whether the old map
+    showed it."""
 
     gaussians: Gaussians
     kept: np.ndarray
@@ -57,7 +59,7 @@ class Today:
     signs: list[Signs]
     gone: list[int]
     motions: dict[int, Motion]
-    added: dict[int, float]
+    added: dict[int, tuple[float, bool]]
     record: TrainRecord
 
 
@@ -65,7 +67,8 @@ def seen_today(visit: Visit) -> Today:
     """Judges the map's instances, adds what is new, and finds out what moved."""
     gmap, run, progress = visit.gmap, visit.run, visit.run.progress
     with run.stage("evidence"):
-        signs = _signs(visit)
+        before = visit.looks(visit.gaussians, visit.ids)
+        signs = _signs(visit, before)
     entries = gmap.instances
     gone = [e["id"] for e, s in zip(entries, signs, strict=True) if not is_removed(e) and s.seen and s.log_odds < 0]
     stays = np.flatnonzero(~np.isin(visit.ids, gone))
@@ -90,18 +93,32 @@ def seen_today(visit: Visit) -> Today:
         free = rows[joined < 0]
         made = grouped(grown, votes, free, run.config)
     things = [(free[made.ids == n], float(made.scores[n])) for n in range(made.count)]
+    with run.stage("evidence"):
+        old = _shown_before(visit, before, grown, things)
     with run.stage("motion"):
         pairs = _moved(visit, grown, things, gone)
-    return _settled(visit, grown, kept, ids, made, free, signs, gone, things, pairs, record)
+    return _settled(visit, grown, kept, ids, made, free, signs, gone, things, old, pairs, record)
 
 
-def _signs(visit: Visit) -> list[Signs]:
+def _signs(visit: Visit, looks: list[Look]) -> list[Signs]:
     gmap, entries = visit.gmap, visit.gmap.instances
-    looks = visit.looks(visit.gaussians, visit.ids)
     seen = seen_rows(looks, visit.gaussians.means.double().numpy(), visit.gaussians.scales.max(dim=1).values.numpy())
     ids = [entry["id"] for entry in entries]
     shares = np.array([np.sum(seen & (visit.ids == i)) / max(1, np.sum(gmap.instance_ids == i)) for i in ids])
     return signs_of(looks, ids, shares, np.array([min(entry["obb"]["extent"]) for entry in entries]))
+
+
+def _shown_before(
+    visit: Visit, before: list[Look], grown: Gaussians, things: list[tuple[np.ndarray, float]]
+) -> set[int]:
+    """Numbers of the things that the old map shows as the photos do, `before`: it only did not know them as things."""
+    ids = np.full(len(grown), -1, np.int32)
+    for j, (rows, _) in enumerate(things):
+        ids[rows] = j
+    looks = [replace(old, ids=new.ids) for old, new in zip(before, visit.looks(grown, ids), strict=True)]
+    anywhere = np.full(len(things), np.inf)  # what is in front of the old surface counts, too
+    signs = signs_of(looks, range(len(things)), np.ones(len(things)), anywhere)
+    return {j for j, each in enumerate(signs) if each.photos and each.log_odds > 0}
 
 
 def _moved(
@@ -145,6 +162,7 @@ def _settled(
     signs: list[Signs],
     gone: list[int],
     things: list[tuple[np.ndarray, float]],
+    old: set[int],
     pairs: dict[int, tuple[int, Motion]],
     record: TrainRecord,
 ) -> Today:
@@ -156,10 +174,10 @@ def _settled(
     part_ids = np.concatenate([parts[kept], np.full(len(grown) - len(kept), -1, np.int32)])
     taken = {j for j, _ in pairs.values()}
     used = [entry["id"] for entry in gmap.instances] + [p["id"] for e in gmap.instances for p in e.get("parts", ())]
-    following, added = max(used, default=-1) + 1, dict[int, float]()
+    following, added = max(used, default=-1) + 1, dict[int, tuple[float, bool]]()
     for j, (rows, score) in enumerate(things):
         if j not in taken:
-            ids[rows], added[following] = following, score
+            ids[rows], added[following] = following, (score, j in old)
             following += 1
     replaced = np.concatenate([np.zeros(0, np.int64), *(things[j][0] for j in taken)])
     stays = np.setdiff1d(np.arange(len(grown)), replaced)
@@ -170,11 +188,11 @@ def _settled(
         [part_ids[stays]],
     )
     for i, (_, motion) in pairs.items():
-        old = np.flatnonzero(gmap.instance_ids == i)
+        own = np.flatnonzero(gmap.instance_ids == i)
         pieces.append(carried(visit.thing(i), motion.new_from_old))
-        names.append(np.full(len(old), i, np.int32))
-        members.append(gmap.membership[old])
-        owned.append(parts[old])
+        names.append(np.full(len(own), i, np.int32))
+        members.append(gmap.membership[own])
+        owned.append(parts[own])
     together = Gaussians.concatenate(pieces)
     config = update_config(run.config, len(visit.photos.views), SETTLING, len(together))
     start = together.sh.clone()

@@ -117,7 +117,7 @@ def _described(visit: Visit, today: Today, encoder: Encoder | None) -> Described
     grouping = Grouping(
         ids,
         today.membership,
-        np.array(list(today.added.values())),
+        np.array([score for score, _ in today.added.values()]),
         none,
         groups=np.full(len(today.added), -1, np.int32),
     )
@@ -139,8 +139,10 @@ def assembled(visit: Visit, today: Today, described: DescribedInstances, output:
             entry = with_geometry(entry, gaussians, rows)
         instances.append(entry)
     for i, entry in zip(today.added, described.instances, strict=True):
-        seen = {"first_seen": number, "last_seen": number, "last_looked_for": number}
-        instances.append({**entry, "id": i, "state": "added", "confidence": round(entry["score"], 3), **seen})
+        known = today.added[i][1]
+        seen = {"first_seen": 0 if known else number, "last_seen": number, "last_looked_for": number}
+        state = {"state": "unchanged" if known else "added", "confidence": round(entry["score"], 3)}
+        instances.append({**entry, "id": i, **state, **seen})
     with run.stage("score"):
         quality = score_views(gaussians, visit.photos.held, gmap.metric)
     arrays = {name: getattr(gaussians, name).numpy() for name in TENSORS}
