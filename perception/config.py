@@ -219,8 +219,14 @@ METHOD = ("densify.", "losses.", "instances.", "train.sh_degree", "language.view
 AnySettings = TypeVar("AnySettings", bound=Settings)
 
 
-def load_config(file: Path | None = None, pairs: list[str] | None = None, preset: str = "default") -> MapConfig:
-    """Defaults, overridden by the preset, the TOML file and KEY=VALUE pairs. Raises InputError for the first error.
+def load_config(
+    file: Path | None = None,
+    pairs: list[str] | None = None,
+    preset: str = "default",
+    given: Mapping[str, tuple[Any, str]] | None = None,
+) -> MapConfig:
+    """Defaults, overridden by the preset, `given` settings (see `settings_from`), the TOML file and KEY=VALUE pairs.
+    Raises InputError for the first error.
 
     >>> config = load_config(pairs=["train.iterations=500", "masks=labels:labels"], preset="fast")
     >>> config.train.iterations, config.train.effort, config.masks
@@ -228,7 +234,7 @@ def load_config(file: Path | None = None, pairs: list[str] | None = None, preset
     """
     if preset not in PRESETS:
         raise InputError(f"--preset: found '{preset}', expected one of: {', '.join(PRESETS)}")
-    given = {key: (value, "--preset") for key, value in PRESETS[preset].items()}
+    given = {key: (value, "--preset") for key, value in PRESETS[preset].items()} | dict(given or {})
     if file is not None:
         given |= {key: (value, str(file)) for key, value in flat(read_toml(file))}
     given |= {key: (text, "--set") for key, text in read_pairs(pairs or []).items()}

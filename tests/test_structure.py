@@ -32,6 +32,7 @@ LAYERS = """
     edit report
     serve
     node viewer pipeline bench models
+    visits
     cli
 """
 HEIGHT = {name: height for height, layer in enumerate(LAYERS.strip().splitlines()) for name in layer.split()}

@@ -32,9 +32,9 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _resume(argv: Sequence[str] | None) -> str:
-    """The command that continues the interrupted one; `map` needs --resume for that."""
+    """The command that continues the interrupted one; `map` and `update` need --resume for that."""
     arguments = [str(argument) for argument in (sys.argv[1:] if argv is None else argv)]
-    more = ["--resume"] if arguments[:1] == ["map"] and "--resume" not in arguments else []
+    more = ["--resume"] if arguments[:1] in (["map"], ["update"]) and "--resume" not in arguments else []
     return shlex.join(["perception", *arguments, *more])
 
 

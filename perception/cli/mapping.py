@@ -1,4 +1,4 @@
-"""`perception map`, `info`, `report`, `demo`; `calibrate` and `frames`, which prepare inputs of `map`."""
+"""`perception map`, `update`, `info`, `report`, `demo`; `calibrate` and `frames`, which prepare inputs of `map`."""
 
 from __future__ import annotations
 
@@ -60,8 +60,19 @@ def _add_map(commands: Any) -> None:
     p.formatter_class, p.late_epilog = argparse.RawDescriptionHelpFormatter, _settings
     p.add_argument("input", type=Path, metavar="INPUT")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="MAP")
-    p.add_argument("--config", type=Path, metavar="FILE.toml")
     p.add_argument("--preset", default="default", help="fast, default, quality or paper")
+    _add_settings(p)
+    _add_engine(p, "where blocks are trained")
+    p = map_command(commands, "update", _update, "a map of today, from a map and the photos of a new visit")
+    p.formatter_class, p.late_epilog = argparse.RawDescriptionHelpFormatter, _settings
+    p.add_argument("input", type=Path, metavar="INPUT", help="of the visit; photos without poses are localised")
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="NEW")
+    _add_settings(p)
+
+
+def _add_settings(p: argparse.ArgumentParser) -> None:
+    """The options of `map` and `update` for settings, and --resume."""
+    p.add_argument("--config", type=Path, metavar="FILE.toml")
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
     p.add_argument(
         "--strict", action="store_const", const=True, help="refuse damaged photos instead of leaving them out"
@@ -72,7 +83,6 @@ def _add_map(commands: Any) -> None:
     for key, (metavar, text) in _SHORTCUTS.items():
         p.add_argument(f"--{key.rpartition('.')[2].replace('_', '-')}", metavar=metavar, help=text, dest=key)
     p.add_argument("--resume", action="store_true", help="go on with an interrupted run")
-    _add_engine(p, "where blocks are trained")
 
 
 def _add_engine(p: argparse.ArgumentParser, what: str) -> None:
@@ -126,6 +136,22 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     engine = Engine(args.engine, args.address)
     with _sigterm_as_interrupt(), Progress() as progress:
         build_map(args.input, args.output, config, resume=args.resume, progress=progress, engine=engine)
+        info = write_own_report(args.output, progress)
+    return map_facts(args.output, info), ""
+
+
+def _update(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.map.outputs import refuse_inputs
+    from perception.progress import Progress
+    from perception.report.page import write_own_report
+    from perception.report.text import map_facts
+    from perception.visits.scene import update_settings
+    from perception.visits.update import update_map
+
+    refuse_inputs([args.output], [args.map])
+    config = update_settings(args.map, args.config, settings_given(args))
+    with _sigterm_as_interrupt(), Progress() as progress:
+        update_map(args.map, args.input, args.output, config, resume=args.resume, progress=progress)
         info = write_own_report(args.output, progress)
     return map_facts(args.output, info), ""
 

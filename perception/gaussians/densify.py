@@ -81,21 +81,24 @@ def densify(
     grad_threshold: float,
     seed: int,
     box: torch.Tensor | None = None,
+    held: int = 0,
 ) -> tuple[torch.Tensor, Gaussians]:
     """Prunes, then clones or splits the best candidates while there are at most `allowed` Gaussians.
 
     extent: scene size in world units. grad_threshold: mean gradient (see Statistics) above which a Gaussian is
-    cloned or split. box: [2, 3] corners of the part of space that matters, see BEYOND; None: all of it. Opacities of
-    cloned Gaussians change in place. Returns the indices [K] int64 of the rows to keep, in order, and the Gaussians to
-    append.
+    cloned or split. box: [2, 3] corners of the part of space that matters, see BEYOND; None: all of it. held: the first
+    rows, which are kept as they are. Opacities of cloned Gaussians change in place. Returns the indices [K] int64 of
+    the rows to keep, in order, and the Gaussians to append.
     """
     needed = _needed(gaussians, statistics)
+    needed[:held] = True
     room = max(0, allowed - int(needed.sum()))
     score = statistics.gradient / statistics.seen.clamp(min=1)
     if box is not None:
         inside = ((gaussians.means >= box[0]) & (gaussians.means < box[1])).all(dim=1)
         score = torch.where(inside, score, BEYOND * score)
     wanted = needed & (score > grad_threshold)
+    wanted[:held] = False
     candidates = torch.nonzero(wanted).flatten()
     if len(candidates) > room:
         best = torch.argsort(score[candidates], descending=True, stable=True)[:room]
@@ -112,9 +115,10 @@ def densify(
     return torch.nonzero(needed).flatten(), born
 
 
-def decay_opacities(gaussians: Gaussians) -> None:
-    """Multiplies every opacity by 1 − OPACITY_DECAY in place. Gaussians that no photo supports fade and are pruned."""
-    gaussians.opacity_logits.copy_(_logit(gaussians.opacities * (1 - OPACITY_DECAY)))
+def decay_opacities(gaussians: Gaussians, held: int = 0) -> None:
+    """Multiplies every opacity by 1 − OPACITY_DECAY in place, but for the first `held`. Gaussians
+    that no photo supports fade and are pruned."""
+    gaussians.opacity_logits[held:] = _logit(gaussians.opacities * (1 - OPACITY_DECAY))[held:]
 
 
 def _logit(opacities: torch.Tensor) -> torch.Tensor:

@@ -147,9 +147,11 @@ def _densify(state: TrainingState, progress: float) -> None:
 
 
 def _grow(state: TrainingState, allowed: int, seed: int) -> None:
-    decay_opacities(state.gaussians)
+    decay_opacities(state.gaussians, state.held)
     threshold = state.config.densify.grad_threshold
-    kept, born = densify(state.gaussians, state.statistics, allowed, state.extent, threshold, seed, state.box)
+    kept, born = densify(
+        state.gaussians, state.statistics, allowed, state.extent, threshold, seed, state.box, state.held
+    )
     state.keep(kept)
     state.append(born)
 
@@ -168,6 +170,7 @@ def _prune(state: TrainingState) -> None:
     columns = [tensor.reshape(len(tensor), -1) for tensor in state.gaussians.named().values()]
     _keep(state, torch.isfinite(torch.cat(columns, dim=1)).all(dim=1), "whose values are not finite")
     seen = torch.zeros_like(state.gaussians.opacity_logits, dtype=torch.bool)
+    seen[: state.held] = True
     with state.record.timed("evaluation"):
         for view in state.views:
             seen |= visible_in(state.gaussians, view)

@@ -76,7 +76,8 @@ class TrainingState:
     """What the steps of a training and its schedule change; `state` exports it for a checkpoint, `load` restores it.
 
     gaussians, views, held_out: on the CPU. Gaussians, optimiser and training views are then kept on `device`. box:
-    [2, 3] corners of the space that matters, in which most Gaussians are added; None: all.
+    [2, 3] corners of the space that matters, in which most Gaussians are added; None: all. held: the first rows, of
+    which nothing but the colours is trained, and that are never dropped.
     """
 
     def __init__(
@@ -87,7 +88,9 @@ class TrainingState:
         held_out: list[TrainingView],
         device: torch.device | None = None,
         box: np.ndarray | None = None,
+        held: int = 0,
     ):
+        self.held = held
         self.config = sized(config, len(views))
         self.device = device or torch.device("cpu")
         self.held_out = held_out

@@ -145,6 +145,10 @@ class Trainer(TrainingState):
         coefficients = self.gaussians.sh.shape[1]
         rates = schedule.learning_rates(progress, self.extent, coefficients, self.config.train.iterations)
         by_name = {stored: getattr(gradients, name) for name, stored in STORED.items()}
+        if self.held:  # a row of zero gradients and moments stays as it is
+            for name, gradient in by_name.items():
+                if name != "sh" and gradient is not None:
+                    gradient[: self.held] = 0
         self.record.skipped_gradients += int(sum(self.optimiser.step(rates, by_name, visible).values()))
 
     def _losses(self, view: TrainingView, out: Forward) -> tuple[float, Cotangents]:

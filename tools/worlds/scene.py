@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import ModuleType
 
 import cv2
 import numpy as np
@@ -53,10 +54,18 @@ def make_photos(
         raise InputError(f"demo photos: {views} views of {width}x{height} asked; at least 3 views of 64x48 are needed")
     folder = Path(folder)
     home = truth_folder or folder.parent / "truth"
+    made: Scene = maker.build(seed, light_samples)
+    return photograph(made, maker, made.cameras(views, width, height), folder, home, seed)[0]
+
+
+def photograph(
+    made: Scene, maker: ModuleType, cameras: list[Camera], folder: Path, home: Path, seed: int
+) -> tuple[DemoTruth, list[Picture]]:
+    """Writes the photos of a built scene into `folder` and the truth into `home`, as `make_photos`; the truth, and the
+    pictures without noise. maker: the module that built it."""
+    views = len(cameras)
     for path in (folder, *(home / name for name in ("labels", "labels_sam", "masks_gt", "depth"))):
         path.mkdir(parents=True, exist_ok=True)
-    made: Scene = maker.build(seed, light_samples)
-    cameras = made.cameras(views, width, height)
     digits = max(3, len(str(views - 1)))
     names = [f"{i:0{digits}d}.jpg" for i in range(views)]
     stuff = {number for number, body in enumerate(made.bodies, start=1) if body.is_stuff}
@@ -78,13 +87,13 @@ def make_photos(
     with ThreadPoolExecutor(WORKERS) as pool:  # numpy and OpenCV release the GIL in their loops
         pictures = list(pool.map(shoot, range(views)))
     cloud = _surface(made, maker.POINTS, np.random.default_rng((seed, views)))
-    seen = _times_seen(cloud[0], cloud[1], cloud[3], cameras, pictures) >= 2
+    seen = times_seen(cloud[0], cloud[1], cloud[3], cameras, pictures) >= 2
     points, normals, colors, ids = (column[seen] for column in cloud)
     instances = _instances(made, ids, pictures)
     photos = Path(os.path.relpath(folder, home)).as_posix()
     truth = DemoTruth(instances, made.asked, names, cameras, points, normals, colors, ids, home, photos)
     truth.save()
-    return truth
+    return truth, pictures
 
 
 def _instances(made: Scene, ids: np.ndarray, pictures: list[Picture]) -> list[Truth]:
@@ -143,7 +152,7 @@ def _even(shape: Shape, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.nd
     return u, v
 
 
-def _times_seen(
+def times_seen(
     points: np.ndarray, normals: np.ndarray, ids: np.ndarray, cameras: list[Camera], pictures: list[Picture]
 ) -> np.ndarray:
     """Number of photos that see each point: inside the frame, facing the camera, and not occluded."""

@@ -1,0 +1,130 @@
+"""What the photos of a visit say about each thing of the map: still there, not there any more, or not looked at.
+
+A photo looks at a thing where the map's render shows it and no measured surface is in front of it. There three signs
+are read: whether brightness varies as the map says (correlation, which exposure and light hardly change), whether one
+mask of the photo has the thing's outline, and whether the rays end at the thing's surface or behind it. Colours alone
+count little. Their log-odds add up to the probability that the thing stands where it stood.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from perception.visits.look import Look, correlation, projected
+
+AGREE = 0.03
+"""Relative difference of depths up to which two are of one surface: the noise of stereo."""
+LEAST_PIXELS = 30
+"""Pixels of a thing in a photo that looks at it."""
+UNSEEN = 0.12
+"""Least share of a thing's surface that a visit must see to judge it."""
+WEIGHTS = {"correlation": (14.0, 0.52), "outline": (3.0, 0.60), "colour": (-8.0, 0.12), "through": (-2.0, 0.20)}
+"""Log-odds of "still there" per unit of each sign, and the value at which a sign says nothing."""
+
+SAME_OUTLINE = 6.0
+"""Further log-odds per unit of the outlines' IoU for a thing at a new spot, where another thing may stand."""
+
+
+@dataclass(frozen=True)
+class Signs:
+    """What a visit shows of one thing. pixels: that look at it, in photos; share: of its surface that was seen, in
+    [0, 1]; correlation, outline (IoU with a mask), colour (difference), through and hit (shares of measured rays that
+    end behind it and at it); NaN where nothing was measured."""
+
+    photos: int
+    pixels: int
+    share: float
+    correlation: float
+    outline: float
+    colour: float
+    through: float
+    hit: float
+
+    @property
+    def log_odds(self) -> float:
+        """Of the thing standing where it stood, positive for yes."""
+        values = ((getattr(self, name), *weight) for name, weight in WEIGHTS.items())
+        return float(sum(slope * (value - middle) for value, slope, middle in values if np.isfinite(value)))
+
+    @property
+    def same(self) -> float:
+        """Log-odds of being the thing that stands at a new spot: outlines count more, which of other things differ."""
+        outline = 0.0 if np.isnan(self.outline) else SAME_OUTLINE * (self.outline - WEIGHTS["outline"][1])
+        return self.log_odds + outline
+
+    @property
+    def seen(self) -> bool:
+        """Whether the visit saw enough of it to judge."""
+        return self.photos > 0 and self.share >= UNSEEN
+
+
+def probability(log_odds: float) -> float:
+    """In [0, 1], of log-odds."""
+    return float(1 / (1 + np.exp(-np.clip(log_odds, -30, 30))))
+
+
+def signs_of(looks: Sequence[Look], things: Sequence[int], shares: np.ndarray, depths: np.ndarray) -> list[Signs]:
+    """The signs of each of the `things`. shares [K]: of its surface seen; depths [K]: its smallest extent."""
+    number = {int(thing): n for n, thing in enumerate(things)}
+    sums = np.zeros((len(things), 11))
+    for shown in looks:
+        labels = shown.labels
+        areas = np.bincount(labels.ravel())
+        measured = shown.measured > 0
+        for thing in np.unique(shown.ids[shown.ids >= 0]).tolist():
+            if thing in number:
+                n = number[thing]
+                sums[n] += _in_photo(shown, shown.ids == thing, labels, areas, measured, depths[n])
+    return [_signs(row, float(share)) for row, share in zip(sums, shares, strict=True)]
+
+
+def _in_photo(
+    shown: Look, mask: np.ndarray, labels: np.ndarray, areas: np.ndarray, measured: np.ndarray, depth: float
+) -> np.ndarray:
+    """The sums of 11: photos, pixels, covariance, variances (2), IoU × pixels, labelled pixels, colour, rays measured,
+    through and hit."""
+    near = shown.mapped * (1 - AGREE) - depth
+    mask = mask & ~(measured & (shown.measured < near))
+    pixels = int(mask.sum())
+    if pixels < LEAST_PIXELS:
+        return np.zeros(11)
+    inside = np.bincount(labels[mask], minlength=len(areas))
+    inside[0] = 0
+    best = int(inside.argmax())
+    iou = inside[best] / (pixels + areas[best] - inside[best]) if inside[best] else 0.0
+    known = measured & mask
+    ratio = shown.measured[known] / np.maximum(shown.mapped[known], 1e-6)
+    sums = [shown.product[mask].sum(), shown.rendered[mask].sum(), shown.shown[mask].sum()]
+    outline = [iou * pixels, pixels] if labels.any() else [0, 0]
+    rays = [len(ratio), (ratio > 1 + AGREE).sum(), (np.abs(ratio - 1) <= AGREE).sum()]
+    return np.array([1, pixels, *sums, *outline, shown.colour[mask].sum(), *rays], np.float64)
+
+
+def _signs(row: np.ndarray, share: float) -> Signs:
+    photos, pixels, product, a, b, outline, labelled, colour, measured, through, hit = row.tolist()
+
+    def over(x: float, y: float) -> float:
+        return x / y if y else float("nan")
+
+    known = correlation(product, a, b) if pixels else float("nan")
+    rays = (over(through, measured), over(hit, measured))
+    return Signs(int(photos), int(pixels), share, known, over(outline, labelled), over(colour, pixels), *rays)
+
+
+def seen_rows(looks: Sequence[Look], means: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    """[N] bool: Gaussians (means [N, 3], largest scales [N]) whose centre some photo sees: at the map's surface, with
+    nothing measured in front of it."""
+    seen = np.zeros(len(means), bool)
+    for shown in looks:
+        pixel, z = projected(shown.view, means)
+        column, row = np.clip(np.floor(pixel), -1, 1 << 30).astype(np.int64).T
+        height, width = shown.mapped.shape
+        inside = np.flatnonzero((z > 1e-6) & (column >= 0) & (row >= 0) & (column < width) & (row < height))
+        mapped, measured = (image[row[inside], column[inside]] for image in (shown.mapped, shown.measured))
+        limit = (1 + AGREE) * mapped + 2 * scales[inside]
+        free = (measured == 0) | (measured > (1 - 2 * AGREE) * z[inside] - 2 * scales[inside])
+        seen[inside[(mapped > 0) & (z[inside] <= limit) & free]] = True
+    return seen

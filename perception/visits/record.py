@@ -1,0 +1,123 @@
+"""What an update writes about each instance: states, confidences, where it stood; see `map.history`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.boxes import instance_entry
+from perception.gaussians.model import Gaussians
+from perception.language.description import from_arrays, to_arrays
+from perception.map.history import is_removed, visits_of
+from perception.map.map import Map, language_in, prefixed
+from perception.photos.decode import open_photo
+from perception.visits.evidence import UNSEEN, Signs, probability
+from perception.visits.motion import Motion
+
+_GEOMETRY = ("num_gaussians", "centroid", "obb", "aabb")
+_TAKEN = 36867  # EXIF DateTimeOriginal
+_EXIF = 0x8769  # the table that holds it
+
+
+def time_taken(photos: Sequence[Path]) -> datetime | None:
+    """When the newest of the photos was taken, by EXIF, which knows no time zone; None where none says so."""
+    times = []
+    for photo in photos:
+        try:
+            with open_photo(photo) as image:
+                times.append(datetime.strptime(image.getexif().get_ifd(_EXIF)[_TAKEN], "%Y:%m:%d %H:%M:%S"))
+        except (OSError, KeyError, ValueError, TypeError):
+            continue
+    return max(times, default=None)
+
+
+def visit_record(source: Path, photos: Sequence[Path]) -> dict[str, Any]:
+    """An entry of `visits` of map.json. time: when the newest photo was taken, else when its file was written."""
+    taken = time_taken(photos)
+    if taken is None and photos:
+        taken = datetime.fromtimestamp(max(photo.stat().st_mtime for photo in photos), UTC)
+    time = None if taken is None else taken.strftime("%Y-%m-%dT%H:%M:%SZ")
+    return {"time": time, "input": str(source), "photos": len(photos)}
+
+
+def visits_with(gmap: Map, source: Path, photos: Sequence[Path]) -> list[dict[str, Any]]:
+    """`visits` of map.json after this one."""
+    before = [visit.to_json() for visit in visits_of(gmap.info, len(gmap.views))]
+    old = [{key: visit[key] for key in ("time", "input", "photos")} for visit in before]
+    return [*old, visit_record(source, photos)]
+
+
+def with_geometry(entry: dict[str, Any], gaussians: Gaussians, rows: np.ndarray) -> dict[str, Any]:
+    """The entry with the number, centroid and boxes of the Gaussians `rows`."""
+    points, weights = gaussians.means.numpy()[rows].astype(np.float64), gaussians.opacities.numpy()[rows]
+    made = instance_entry(entry["id"], points, weights.astype(np.float64), entry["score"], entry.get("views", 0))
+    return {**entry, **{key: made[key] for key in _GEOMETRY}}
+
+
+def recorded(entry: dict[str, Any], visit: int, signs: Signs, motion: Motion | None, gone: bool) -> dict[str, Any]:
+    """The entry of an old instance after a visit, still with its old geometry. gone: it does not stand there."""
+    known = {"first_seen": 0, "last_seen": visit - 1, "last_looked_for": visit - 1}
+    entry = {**{key: entry.get(key, value) for key, value in known.items()}, **entry}
+    if is_removed(entry):
+        return entry
+    if not signs.seen:
+        return {**entry, "state": "unseen", "confidence": round(1 - 0.5 * min(1.0, signs.share / UNSEEN), 3)}
+    if not gone:
+        return {
+            **entry, "state": "unchanged", "confidence": round(probability(signs.log_odds), 3), "last_seen": visit,
+            "last_looked_for": visit,
+        }  # fmt: skip
+    stood = {"until": visit - 1, **{key: entry[key] for key in _GEOMETRY[1:] if key in entry}}
+    stood["transform"] = None if motion is None else motion.new_from_old.tolist()
+    if motion is not None and motion.ambiguous:
+        stood["ambiguous"] = True
+    past, sure = [*entry.get("past", ()), stood], 1 - probability(signs.log_odds)
+    if motion is None:
+        entry = {key: value for key, value in entry.items() if key != "parts"}
+        entry |= {"state": "removed", "confidence": round(sure, 3), "num_gaussians": 0}
+    else:
+        entry |= {"state": "moved", "confidence": round(sure * probability(motion.signs.same), 3), "last_seen": visit}
+    return {**entry, "last_looked_for": visit, "past": past}
+
+
+def joined_language(old: dict[str, np.ndarray], new: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays of language.npz with the rows of `new` appended."""
+    if not old or not new:
+        return old
+    (before, encoder), (after, _) = from_arrays(old), from_arrays(new)
+    return to_arrays([*before, *after], encoder)
+
+
+def kept_parts(
+    parts: dict[str, np.ndarray], ids: np.ndarray, instances: Sequence[dict[str, Any]]
+) -> dict[str, np.ndarray]:
+    """parts.npz of the Gaussians with part `ids` [N], without the parts of removed instances."""
+    if not parts:
+        return {}
+    before = np.unique(parts["ids"][parts["ids"] >= 0])
+    kept = np.array(sorted(part["id"] for entry in instances for part in entry.get("parts", ())), np.int64)
+    if len(kept) == 0:
+        return {}
+    arrays: dict[str, np.ndarray] = {"ids": np.where(np.isin(ids, kept), ids, -1).astype(np.int32)}
+    if language := language_in(parts):
+        descriptions, encoder = from_arrays(language)
+        chosen = [descriptions[n] for n in np.flatnonzero(np.isin(before, kept))]
+        arrays |= prefixed(to_arrays(chosen, encoder))
+    return arrays
+
+
+def past_with(gmap: Map, gone: Sequence[int], until: int) -> dict[str, np.ndarray]:
+    """past.npz with the means of the instances that no longer stand where they stood."""
+    rows = np.flatnonzero(np.isin(gmap.instance_ids, list(gone)))
+    made = {
+        "means": gmap.means[rows].astype(np.float32),
+        "ids": gmap.instance_ids[rows].astype(np.int32),
+        "until": np.full(len(rows), until, np.int32),
+    }
+    if gmap.past:
+        made = {name: np.concatenate([gmap.past[name], array]) for name, array in made.items()}
+    return made if len(made["ids"]) else {}

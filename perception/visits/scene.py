@@ -1,0 +1,122 @@
+"""The photos of a visit in the frame of the map: with the poses that they bring, or localised."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from perception.config import MapConfig, fields, flat, load_config
+from perception.errors import InputError
+from perception.frame.recentre import map_from_input, moved
+from perception.inputs.load import load_scene
+from perception.inputs.readers import reader_of
+from perception.inputs.transforms import in_map_frame
+from perception.localise.localiser import Localised, Localiser
+from perception.localise.photos import new_photos
+from perception.map.files import read_info
+from perception.map.map import Map
+from perception.photos.views import make_view
+from perception.pipeline.checkpoint import frames_folder
+from perception.pipeline.optimise import Run
+from perception.sfm.options import ReadOptions
+from perception.types import Scene, View
+from perception.visits.look import Look, correlation
+from perception.visits.record import time_taken
+
+NO_CLOUD = np.zeros((1, 3)), np.zeros((1, 3), np.uint8)
+"""The map is what training starts from."""
+LEAST_MAPPED, LEAST_ALIKE = 0.2, 0.35
+"""A photo shows the map where that covers at least this share of it, with at least this correlation of brightness."""
+LEAST_SHARE = 0.8
+"""Share of the photos that must show the map; a few that do not are left out."""
+OF_INPUT = ("photos.camera", "photos.ignore_masks", "photos.init_points", "photos.held_out", "frame.", "device")
+"""Settings, or groups of them, that belong to the input of a map and not to those of its visits."""
+OTHER_UNIT = 1.5
+"""Factor between measured depths and the map's from which the visit is in another unit."""
+
+
+def update_settings(path: Path, file: Path | None, pairs: list[str]) -> MapConfig:
+    """The settings that the map at `path` was made with, but for those of its own input, overridden by the TOML file
+    and KEY=VALUE pairs. InputError for the first error, and where masks have to be given."""
+    known = dict(fields(MapConfig))
+    before = dict(flat(read_info(path).get("config", {})))
+    own = {key: value for key, value in before.items() if key in known and not key.startswith(OF_INPUT)}
+    labels = str(own.get("masks", "")).startswith("labels:")
+    given = {key: (value, str(path / "map.json")) for key, value in own.items() if not (labels and key == "masks")}
+    config = load_config(file, pairs, given=given)
+    if labels and not config.masks.startswith("labels:"):
+        raise InputError(f"--masks: {path} was made with {own['masks']}; give labels:DIR with those of the new photos")
+    return config
+
+
+def visit_scene(run: Run, gmap: Map, output: Path) -> Scene:
+    """The views of the visit, in the map's frame. InputError where there are none, or most are of another scene."""
+    assert gmap.path is not None
+    photos, source = run.config.photos, run.source
+    camera, masks = (Path(file) if file else None for file in (photos.camera, photos.ignore_masks))
+    options = ReadOptions(run.work / "sfm", run.config.seed, run.progress, photos.strict, masks, camera)
+    options = replace(options, frames=frames_folder(output), poses="keep", cloud=NO_CLOUD)
+    if not reader_of(source).poses:
+        return _localised(run, gmap, camera)
+    scene = load_scene(source, options)
+    if not scene.views:
+        raise InputError(f"{source}: holds no posed photo; give photos of a new visit")
+    placed = source / "transforms.json" if source.is_dir() else source
+    if placed.suffix == ".json" and placed.is_file() and in_map_frame(placed):
+        return scene
+    b_from_a = map_from_input(gmap.path, gmap.info)
+    return replace(scene, views=[moved(view, b_from_a) for view in scene.views])
+
+
+def _localised(run: Run, gmap: Map, camera: Path | None) -> Scene:
+    found = new_photos([run.source], camera, run.work / "sfm", run.progress)
+    answers = Localiser(gmap, progress=run.progress).answers(found)
+    here = [answer for answer in answers if isinstance(answer, Localised)]
+    if len(here) < LEAST_SHARE * len(answers):
+        lost = next(answer for answer in answers if not isinstance(answer, Localised))
+        first = f"first: {lost.name}: {lost.why}"
+        many = f"{len(answers) - len(here)} of {len(answers)} photos are not in {gmap.path} ({first})"
+        raise InputError(f"{run.source}: {many}; give photos of the mapped scene, or map this one anew")
+    depths = {photo.name: photo.depth for photo in found}
+    views = [
+        replace(make_view(a.name, a.photo, a.lens, a.camera_from_map, a.photo), depth=depths[a.name]) for a in here
+    ]
+    left = [{"name": a.name, "why": a.why} for a in answers if not isinstance(a, Localised)]
+    report = {"input": "photos", "left_out": left}
+    none = np.zeros((0, 3))
+    return Scene(sorted(views, key=lambda v: v.name), none, none.astype(np.uint8), gmap.metric, gmap.frame, report)
+
+
+def refuse_older(gmap: Map, views: Sequence[View]) -> None:
+    """InputError where the photos were taken before those of the map's newest visit, by EXIF."""
+    newest = max((getattr(view, "visit", 0) for view in gmap.views), default=0)
+    before = [view.photo for view in gmap.located_views() if getattr(view, "visit", 0) == newest]
+    map_time, time = time_taken([photo for photo in before if photo != Path()]), time_taken([v.photo for v in views])
+    if map_time is not None and time is not None and time < map_time:
+        when = f"its photos were taken until {time}, those of {gmap.path} until {map_time}"
+        raise InputError(f"{views[0].photo.parent}: is older than the map: {when}; update the older map with this one")
+
+
+def foreign_photos(source: Path, gmap: Map, looks: Sequence[Look]) -> list[str]:
+    """Names of the photos that do not show the map. InputError where those are many, or depth has another unit."""
+    ratios = [
+        np.median(shown.view.depth.numpy()[both] / shown.mapped[both])
+        for shown in looks
+        if shown.view.depth is not None and (both := (shown.view.depth.numpy() > 0) & (shown.mapped > 0)).any()
+    ]
+    if ratios and not 1 / OTHER_UNIT < (ratio := float(np.median(ratios))) < OTHER_UNIT:
+        what = f"its depth images measure {ratio:.3g} times the depth of {gmap.path}"
+        raise InputError(f"{source}: is in another unit: {what}; give depth and poses in the map's unit")
+    foreign = []
+    for shown in looks:
+        mapped = shown.mapped > 0
+        sums = [float(image[mapped].sum()) for image in (shown.product, shown.rendered, shown.shown)]
+        if mapped.mean() < LEAST_MAPPED or correlation(*sums) < LEAST_ALIKE:
+            foreign.append(shown.view.name)
+    if len(foreign) > (1 - LEAST_SHARE) * len(looks):
+        many = f"{len(foreign)} of {len(looks)} photos do not show what {gmap.path} holds there (first: {foreign[0]})"
+        raise InputError(f"{source}: {many}; its poses have another frame or unit, or it is another scene: map it anew")
+    return foreign

@@ -1,0 +1,211 @@
+"""What stands where today: the map's instances judged, new ones added, and those that moved recognised."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from perception.gaussians.model import Gaussians, Nearby
+from perception.gaussians.state import TrainRecord
+from perception.instances.group import Grouping
+from perception.instances.votes import mask_votes
+from perception.map.history import is_removed
+from perception.visits.evidence import Signs, seen_rows, signs_of
+from perception.visits.growth import (
+    GROWING,
+    SETTLING,
+    SPARE,
+    grouped,
+    joined_instances,
+    new_surface,
+    trained,
+    update_config,
+)
+from perception.visits.look import Look
+from perception.visits.motion import (
+    ALIKE,
+    CERTAIN,
+    CLOSE,
+    HOPELESS,
+    LIKELY,
+    MOVED,
+    Motion,
+    assigned,
+    carried,
+    looks_alike,
+    motions_of,
+    settled,
+)
+from perception.visits.visit import Visit, gaussians_of
+
+UP = (0.0, 0.0, 1.0)
+"""Of a map that does not record gravity."""
+
+
+@dataclass
+class Today:
+    """What stands where today: the Gaussians, of which the first rows are the rows `kept` [H] of the map; ids [N] int32
+    instance, `membership` [N], part_ids [N]; signs of the map's instances, in their order; `gone`: ids of those that do
+    not stand where they stood; motions by id; `added`: of the new ones, by id, the score and whether the old map
+    showed it."""
+
+    gaussians: Gaussians
+    kept: np.ndarray
+    ids: np.ndarray
+    membership: np.ndarray
+    part_ids: np.ndarray
+    signs: list[Signs]
+    gone: list[int]
+    motions: dict[int, Motion]
+    added: dict[int, tuple[float, bool]]
+    record: TrainRecord
+
+
+def seen_today(visit: Visit) -> Today:
+    """Judges the map's instances, adds what is new, and finds out what moved."""
+    gmap, run, progress = visit.gmap, visit.run, visit.run.progress
+    with run.stage("evidence"):
+        before = visit.looks(visit.gaussians, visit.ids)
+        signs = _signs(visit, before)
+    entries = gmap.instances
+    gone = [e["id"] for e, s in zip(entries, signs, strict=True) if not is_removed(e) and s.seen and s.log_odds < 0]
+    stays = np.flatnonzero(~np.isin(visit.ids, gone))
+    held, ids, kept = visit.gaussians.rows(torch.from_numpy(stays)), visit.ids[stays], visit.rows[stays]
+    with run.stage("look"):
+        looks = visit.looks(held, ids)
+    new = new_surface(looks, held, run.config.train.budget or len(visit.gaussians), run.config.seed)
+    progress.log(f"{len(gone)} things do not stand where they stood; {len(new)} points of new surface")
+    config = update_config(run.config, len(visit.photos.views), GROWING, len(held) + SPARE * len(new))
+    together = Gaussians.concatenate([held, new])
+    grown, record = trained(run, "grow", visit.mark, visit.masks["identity"], together, len(held), visit.photos, config)
+
+    with run.stage("instances"):
+        rows = np.arange(len(held), len(grown))
+        votes = mask_votes(Nearby(grown), visit.photos.views, half_resolution=run.config.losses.half_resolution)
+        ids = np.concatenate([ids, np.full(len(rows), -1, np.int32)])
+        known, number = np.unique(ids[ids >= 0], return_inverse=True)
+        dense = np.full(len(ids), -1, np.int32)
+        dense[ids >= 0] = number
+        joined = joined_instances(votes, dense, rows)
+        ids[rows] = np.append(known, -1)[joined]
+        free = rows[joined < 0]
+        made = grouped(grown, votes, free, run.config)
+    things = [(free[made.ids == n], float(made.scores[n])) for n in range(made.count)]
+    with run.stage("evidence"):
+        old = _shown_before(visit, before, grown, things)
+    with run.stage("motion"):
+        pairs = _moved(visit, grown, things, gone)
+    return _settled(visit, grown, kept, ids, made, free, signs, gone, things, old, pairs, record)
+
+
+def _signs(visit: Visit, looks: list[Look]) -> list[Signs]:
+    gmap, entries = visit.gmap, visit.gmap.instances
+    seen = seen_rows(looks, visit.gaussians.means.double().numpy(), visit.gaussians.scales.max(dim=1).values.numpy())
+    ids = [entry["id"] for entry in entries]
+    shares = np.array([np.sum(seen & (visit.ids == i)) / max(1, np.sum(gmap.instance_ids == i)) for i in ids])
+    return signs_of(looks, ids, shares, np.array([min(entry["obb"]["extent"]) for entry in entries]))
+
+
+def _shown_before(
+    visit: Visit, before: list[Look], grown: Gaussians, things: list[tuple[np.ndarray, float]]
+) -> set[int]:
+    """Numbers of the things that the old map shows as the photos do, `before`: it only did not know them as things."""
+    ids = np.full(len(grown), -1, np.int32)
+    for j, (rows, _) in enumerate(things):
+        ids[rows] = j
+    looks = [replace(old, ids=new.ids) for old, new in zip(before, visit.looks(grown, ids), strict=True)]
+    anywhere = np.full(len(things), np.inf)  # what is in front of the old surface counts, too
+    signs = signs_of(looks, range(len(things)), np.ones(len(things)), anywhere)
+    return {j for j, each in enumerate(signs) if each.photos and each.log_odds > 0}
+
+
+def _moved(
+    visit: Visit, grown: Gaussians, things: list[tuple[np.ndarray, float]], gone: list[int]
+) -> dict[int, tuple[int, Motion]]:
+    """By id of an instance that is gone: the number of the new thing that it is, and its motion."""
+    if not gone or not things:
+        return {}
+    olds = {i: visit.thing(i) for i in gone}
+    depth = {entry["id"]: min(entry["obb"]["extent"]) for entry in visit.gmap.instances}
+    gravity = visit.gmap.info.get("gravity")
+    up = np.array(UP) if gravity is None else -np.array(gravity["direction"], np.float64)
+    odds, motions = np.full((len(gone), len(things)), -np.inf), dict[tuple[int, int], Motion]()
+    for j, (own, _) in enumerate(things):
+        new = grown.rows(torch.from_numpy(own))
+        rest = grown.rows(torch.from_numpy(np.setdiff1d(np.arange(len(grown)), own)))
+        alike = np.argsort([looks_alike(olds[i], new) for i in gone], kind="stable")[::-1][:ALIKE]
+        guesses = {a: motions_of(olds[gone[a]], new, visit.frames, rest, up, depth[gone[a]]) for a in alike.tolist()}
+        guesses = {a: guess for a, guess in guesses.items() if guess[0] and guess[0][0][0].same > HOPELESS}
+        for a in sorted(guesses, key=lambda a: -guesses[a][0][0][0].same)[:LIKELY]:
+            motion = settled(olds[gone[a]], *guesses[a], depth[gone[a]])
+            odds[a, j], motions[a, j] = motion.signs.same, motion
+            if motion.signs.same > CERTAIN:
+                break
+        visit.run.progress.update("motions", j + 1, len(things))
+    pairs = {}
+    for a, j in assigned(odds, MOVED):
+        rivals = np.concatenate([np.delete(odds[:, j], a), np.delete(odds[a], j)])
+        alike = rivals.max(initial=-np.inf) > odds[a, j] - CLOSE
+        pairs[gone[a]] = (j, replace(motions[a, j], ambiguous=motions[a, j].ambiguous or bool(alike)))
+    return pairs
+
+
+def _settled(
+    visit: Visit,
+    grown: Gaussians,
+    kept: np.ndarray,
+    ids: np.ndarray,
+    made: Grouping,
+    free: np.ndarray,
+    signs: list[Signs],
+    gone: list[int],
+    things: list[tuple[np.ndarray, float]],
+    old: set[int],
+    pairs: dict[int, tuple[int, Motion]],
+    record: TrainRecord,
+) -> Today:
+    """Puts the Gaussians of moved things where the new ones grew, and trains the colours of all that was looked at."""
+    gmap, run = visit.gmap, visit.run
+    membership = np.concatenate([gmap.membership[kept], np.ones(len(grown) - len(kept), np.float32)])
+    membership[free] = np.where(made.ids >= 0, made.membership, 0)
+    parts = gmap.parts["ids"] if "ids" in gmap.parts else np.full(len(gmap), -1, np.int32)
+    part_ids = np.concatenate([parts[kept], np.full(len(grown) - len(kept), -1, np.int32)])
+    taken = {j for j, _ in pairs.values()}
+    used = [entry["id"] for entry in gmap.instances] + [p["id"] for e in gmap.instances for p in e.get("parts", ())]
+    following, added = max(used, default=-1) + 1, dict[int, tuple[float, bool]]()
+    for j, (rows, score) in enumerate(things):
+        if j not in taken:
+            ids[rows], added[following] = following, (score, j in old)
+            following += 1
+    replaced = np.concatenate([np.zeros(0, np.int64), *(things[j][0] for j in taken)])
+    stays = np.setdiff1d(np.arange(len(grown)), replaced)
+    pieces, names, members, owned = (
+        [grown.rows(torch.from_numpy(stays))],
+        [ids[stays]],
+        [membership[stays]],
+        [part_ids[stays]],
+    )
+    for i, (_, motion) in pairs.items():
+        own = np.flatnonzero(gmap.instance_ids == i)
+        pieces.append(carried(visit.thing(i), motion.new_from_old))
+        names.append(np.full(len(own), i, np.int32))
+        members.append(gmap.membership[own])
+        owned.append(parts[own])
+    together = Gaussians.concatenate(pieces)
+    config = update_config(run.config, len(visit.photos.views), SETTLING, len(together))
+    start = together.sh.clone()
+    final, last = trained(
+        run, "settle", visit.mark, visit.masks["identity"], together, len(together), visit.photos, config
+    )
+    unseen = (final.sh[: len(kept)] == start[: len(kept)]).flatten(1).all(dim=1)
+    original = torch.from_numpy(gmap.sh[kept])
+    final.sh[: len(kept)] = torch.where(unseen[:, None, None], original, final.sh[: len(kept)])
+    rest = np.setdiff1d(np.flatnonzero(~np.isin(gmap.instance_ids, gone)), visit.rows)  # no photo may show these
+    whole = Gaussians.concatenate([gaussians_of(gmap, rest), final])
+    names, members, owned = [gmap.instance_ids[rest], *names], [gmap.membership[rest], *members], [parts[rest], *owned]
+    arrays = (np.concatenate(names).astype(np.int32), np.concatenate(members), np.concatenate(owned).astype(np.int32))
+    motions = {i: motion for i, (_, motion) in pairs.items()}
+    record = TrainRecord.joined([record, last])
+    return Today(whole, np.concatenate([rest, kept]), *arrays, signs, gone, motions, added, record)

@@ -1,0 +1,205 @@
+"""`perception update`: a map of today from a map and a new visit.
+
+poses      of the visit in the map's frame, given or localised                        `scene`
+look       exposure of the visits, stereo depth, masks; the map beside the photos     `look`
+evidence   what still stands where it stood, what does not, what nobody looked at     `evidence`
+grow       new Gaussians where the photos show another surface, the rest held         `growth`
+motion     which new thing is which one that is gone, and how it moved                `motion`
+settle     colours of all that was looked at; a moved thing keeps its own Gaussians   `growth`
+record     states, confidences and past places of all instances                       `record`
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.config import MapConfig
+from perception.errors import InputError
+from perception.gaussians.device import choose_device
+from perception.gaussians.model import Nearby
+from perception.instances.group import Grouping
+from perception.language.base import Encoder
+from perception.language.ocr import make_reader
+from perception.map.checksums import is_map
+from perception.map.files import read_info
+from perception.map.history import is_removed
+from perception.map.write import Map, read_map, write_map
+from perception.masks import make_source
+from perception.photos.view_json import StoredView, moved_record, stored_view
+from perception.pipeline.changes import hold_inputs
+from perception.pipeline.checkpoint import check_name, clear_work, digest, fingerprint, working
+from perception.pipeline.instances import DescribedInstances, describe
+from perception.pipeline.optimise import Optimised, Run
+from perception.pipeline.record import finite, score_views
+from perception.progress import QUIET, Progress
+from perception.visits.record import joined_language, kept_parts, past_with, recorded, visits_with, with_geometry
+from perception.visits.today import Today, seen_today
+from perception.visits.visit import TENSORS, Visit, open_visit
+
+
+def update_map(
+    path: Path,
+    source: Path,
+    output: Path,
+    config: MapConfig,
+    *,
+    resume: bool = False,
+    progress: Progress = QUIET,
+) -> Map:
+    """Writes the map of today to `output`: the map at `path`, changed as the photos of `source` show.
+
+    config: settings, usually those of the map (`update_settings`). Gaussians that no photo looked at stay as they are,
+    bit for bit; of the others that stay, colours alone are trained. Ids, names and the frame are kept. What a run has
+    made is kept beside `output` until the map is written; `resume` goes on from there. InputError for bad input:
+    another scene, another unit, photos older than the map, masks of another kind. The map at `path` is only read.
+    """
+    check_name(output)
+    gmap = read_map(path)
+    mark = digest(gmap.map_id, fingerprint(source, config))
+    if resume and is_map(output) and read_info(output).get("fingerprint") == mark:
+        progress.log(f"{output}: this run is finished")
+        clear_work(output)
+        return read_map(output)
+    with working(source, output, resume) as work:
+        hold_inputs(work, source, config, output)
+        device, notice = choose_device(config.device)
+        if notice is not None:
+            progress.log(notice)
+        run = Run(source, config, work, work / "masks", device, progress)
+        masks = make_source(config.masks, config.sam)
+        _refuse_other_masks(gmap, masks.name)
+        encoder = _encoder_of(gmap)
+        visit = open_visit(run, gmap, masks, output)
+        today = seen_today(visit)
+        described = _described(visit, today, encoder)
+        made = assembled(visit, today, described, output, mark)
+        run.inputs = hold_inputs(work, source, config, output)
+        made.info["inputs"] = run.inputs
+        write_map(output, made, fresh=True)
+    _log_result(made, output, progress)
+    return made
+
+
+def _refuse_other_masks(gmap: Map, name: str) -> None:
+    before = gmap.info.get("masks", {}).get("source")
+    if before is not None and before != name:
+        what = f"the masks of {gmap.path} come from {before}, those of the visit from {name}"
+        raise InputError(f"--masks: {what}, and these cut things otherwise; give masks from {before}")
+
+
+def _encoder_of(gmap: Map) -> Encoder | None:
+    """The encoder that described the map's instances; None for a map without language."""
+    if not gmap.language:
+        return None
+    from perception.language.description import check_encoder
+    from perception.language.encoders import make_encoder
+
+    spec = gmap.setting("language", "encoder", "auto")
+    encoder = make_encoder("conse" if spec == "auto" else spec)
+    assert encoder is not None
+    check_encoder(str(gmap.language["encoder"]), encoder.identity)
+    return encoder
+
+
+# ----------------------------------------------------------------------- record
+
+
+def _described(visit: Visit, today: Today, encoder: Encoder | None) -> DescribedInstances:
+    """Entries and embeddings of the added instances, in their order."""
+    ids = np.full(len(today.ids), -1, np.int32)
+    for n, i in enumerate(today.added):
+        ids[today.ids == i] = n
+    none = np.full(len(ids), -1, np.int32)
+    grouping = Grouping(
+        ids,
+        today.membership,
+        np.array([score for score, _ in today.added.values()]),
+        none,
+        groups=np.full(len(today.added), -1, np.int32),
+    )
+    optimised = Optimised(Nearby(today.gaussians), visit.photos, today.record, visit.masks)
+    reader = make_reader(visit.run.config.language.texts) if today.added else None
+    with visit.run.stage("instances"):
+        return describe(optimised, grouping, visit.run, encoder if today.added else None, reader)
+
+
+def assembled(visit: Visit, today: Today, described: DescribedInstances, output: Path, mark: str) -> Map:
+    """The map of today."""
+    gmap, run, number = visit.gmap, visit.run, visit.number
+    gaussians = today.gaussians
+    instances = []
+    for entry, signs in zip(gmap.instances, today.signs, strict=True):
+        motion, rows = today.motions.get(entry["id"]), np.flatnonzero(today.ids == entry["id"])
+        entry = recorded(entry, number, signs, motion, entry["id"] in today.gone)
+        if not is_removed(entry) and (motion is not None or len(rows) != entry["num_gaussians"]):
+            entry = with_geometry(entry, gaussians, rows)
+        instances.append(entry)
+    for i, entry in zip(today.added, described.instances, strict=True):
+        known = today.added[i][1]
+        seen = {"first_seen": 0 if known else number, "last_seen": number, "last_looked_for": number}
+        state = {"state": "unchanged" if known else "added", "confidence": round(entry["score"], 3)}
+        instances.append({**entry, "id": i, **state, **seen})
+    with run.stage("score"):
+        quality = score_views(gaussians, visit.photos.held, gmap.metric)
+    arrays = {name: getattr(gaussians, name).numpy() for name in TENSORS}
+    fresh = slice(len(today.kept), None)
+    norm = np.linalg.norm(arrays["quats"][fresh], axis=1, keepdims=True)
+    arrays["quats"][fresh] = arrays["quats"][fresh] / np.maximum(norm, 1e-12)
+    groups = dict(gmap.groups)
+    if groups:
+        groups["of"] = np.append(groups["of"], np.full(len(today.added), -1)).astype(np.int32)
+    assert gmap.path is not None
+    old = [view for view in gmap.views if isinstance(view, StoredView)]
+    views = [*(moved_record(view, gmap.path, output) for view in old), *_views(visit, output)]
+    info = {**gmap.info, "visits": visits_with(gmap, run.source, [v.photo for v in views if v.visit == number])}
+    info |= {"quality": quality, "config": run.config.to_json(), "fingerprint": mark, "seconds": dict(run.seconds)}
+    info["instances"] = {**info.get("instances", {}), "count": len(instances)}
+    info |= {"training": asdict(today.record), "masks": visit.masks}
+    return Map(
+        **arrays,
+        instance_ids=today.ids,
+        membership=today.membership,
+        instances=finite(instances),
+        info=finite(info),
+        views=views,
+        language=joined_language(gmap.language, _renamed(described.language, number)),
+        parts=kept_parts(gmap.parts, today.part_ids, instances),
+        groups=groups,
+        past=past_with(gmap, today.gone, number - 1),
+    )
+
+
+def _views(visit: Visit, output: Path) -> list[Any]:
+    """The views of the visit as the map records them; the visit is part of their names, which are unique."""
+    photos, made = visit.photos, []
+    decoded = {view.name: view for view in (*photos.views, *photos.held)}
+    held = {view.name for view in photos.held}
+    for view in sorted([*photos.training, *photos.held_out], key=lambda view: view.name):
+        gain = decoded[view.name].gain
+        view = replace(view, gain=None if gain is None else tuple(gain.double().tolist()))
+        record = stored_view(view, output, view.name in held, visit.number)
+        made.append(replace(record, name=_name(view.name, visit.number)))
+    return made
+
+
+def _name(photo: str, number: int) -> str:
+    return f"visit{number}/{photo}"
+
+
+def _renamed(language: dict[str, np.ndarray], number: int) -> dict[str, np.ndarray]:
+    if not language:
+        return {}
+    names = np.array([_name(str(name), number) for name in language["view_names"]], dtype=np.str_)
+    return {**language, "view_names": names}
+
+
+def _log_result(gmap: Map, output: Path, progress: Progress) -> None:
+    states = [entry.get("state") for entry in gmap.instances]
+    counts = ", ".join(f"{states.count(s)} {s}" for s in ("moved", "removed", "added", "unchanged", "unseen"))
+    psnr = gmap.info["quality"].get("psnr")
+    scored = f", held-out PSNR {psnr:.2f} dB" if psnr else ""
+    progress.log(f"{output}: {len(gmap)} Gaussians; {counts}{scored}")

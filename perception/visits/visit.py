@@ -1,0 +1,121 @@
+"""The photos of a visit, exposed, with depth and masks, beside the part of the map that they may show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from perception.gaussians.model import Gaussians
+from perception.gaussians.photos import split_scene
+from perception.gaussians.views import TrainingView
+from perception.map.map import Map
+from perception.masks import MaskSource
+from perception.masks.stereo import StereoView
+from perception.pipeline.checkpoint import digest, training_mark
+from perception.pipeline.optimise import Photos, Run, label_photos
+from perception.visits.look import Look, compared, depth_at, in_light, in_view, look, stereo_of, with_exposure
+from perception.visits.scene import foreign_photos, refuse_older, visit_scene
+
+TENSORS = ("means", "quats", "log_scales", "opacity_logits", "sh", "features")
+"""Of `Gaussians`, and fields of a map."""
+
+
+def gaussians_of(gmap: Map, rows: np.ndarray) -> Gaussians:
+    """The Gaussians `rows` [R] of a map."""
+    return Gaussians(**{name: torch.from_numpy(getattr(gmap, name)[rows]) for name in TENSORS})
+
+
+@dataclass
+class Visit:
+    """The photos of a visit against the map. number: of the visit; rows [R]: of the map's Gaussians, those that a photo
+    may show; gaussians: these, in the light of the visit, with instances ids [R]; light [3]: its colours over the
+    map's; photos: exposed and labelled; stereo: depths of the training photos; masks: report; mark: of its training."""
+
+    run: Run
+    gmap: Map
+    number: int
+    rows: np.ndarray
+    gaussians: Gaussians
+    light: np.ndarray
+    photos: Photos
+    stereo: list[StereoView | None]
+    masks: dict[str, Any]
+    mark: str
+
+    @property
+    def ids(self) -> np.ndarray:
+        """[R] int32 instance of each of `gaussians`, −1 = none."""
+        return self.gmap.instance_ids[self.rows]
+
+    def thing(self, instance: int) -> Gaussians:
+        """All Gaussians of an instance of the map, in the light of the visit."""
+        return in_light(gaussians_of(self.gmap, np.flatnonzero(self.gmap.instance_ids == instance)), self.light)
+
+    @property
+    def frames(self) -> list[tuple[TrainingView, np.ndarray]]:
+        """The training photos at full size, and what was measured in them."""
+        pairs = zip(self.photos.views, self.stereo, strict=True)
+        return [(view, depth_at(stereo, view.photo.shape)) for view, stereo in pairs]
+
+    def looks(self, gaussians: Gaussians, ids: np.ndarray) -> list[Look]:
+        """The training photos beside the Gaussians with instances ids [N]."""
+        small = map(compared, self.photos.views)
+        pairs = zip(small, self.stereo, strict=True)
+        return [look(gaussians, ids, view, depth_at(stereo, view.photo.shape)) for view, stereo in pairs]
+
+
+def open_visit(run: Run, gmap: Map, source: MaskSource, output: Path) -> Visit:
+    """The photos of the visit, with exposure, stereo depth and masks."""
+    with run.stage("poses"):
+        scene = visit_scene(run, gmap, output)
+        refuse_older(gmap, scene.views)
+    for entry in scene.report.get("left_out", []):
+        run.progress.log(f"left out: {entry['name']} ({entry['why']})")
+    scene, training, held_out = split_scene(scene, run.config.photos)
+    photos = Photos.load(run, training, held_out)
+    rows = np.flatnonzero(in_view(gmap.means, gmap.scales.max(axis=1), [*photos.views, *photos.held]))
+    old, ids = gaussians_of(gmap, rows), gmap.instance_ids[rows]
+    with run.stage("look"):
+        photos, light = _exposed(old, photos)
+        lit = in_light(old, light)
+        shown = [look(lit, ids, compared(v), np.zeros(compared(v).photo.shape[:2])) for v in photos.views]
+        foreign = foreign_photos(run.source, gmap, shown)
+        photos = _without(photos, foreign)
+        for name in foreign:
+            run.progress.log(f"left out: {name} (does not show what the map holds there)")
+        run.progress.log(f"{len(photos.views)} photos of the visit; light {', '.join(f'{x:.2f}' for x in light)}")
+        stereo = stereo_of(old, photos.training, photos.views, run.progress)
+    depths = {view.name: each for view, each in zip(photos.training, stereo, strict=True)}
+    photos, masks = label_photos(
+        run, photos, source, lambda view: depth_at(depths[view.name], view.photo.shape, confirmed=False)
+    )
+    number = len(gmap.info.get("visits") or [0])
+    mark = digest(gmap.map_id, training_mark(run.source, run.config), source.identity)
+    return Visit(run, gmap, number, rows, lit, light, photos, stereo, masks, mark)
+
+
+def _exposed(old: Gaussians, photos: Photos) -> tuple[Photos, np.ndarray]:
+    """The photos with their gains; those held out as their neighbours."""
+    views, light = with_exposure(old, photos.views)
+    held = []
+    for view in photos.held:
+        near = sorted(views, key=lambda other: abs(_number(view.name, other.name, views)))[:2]
+        gains = [other.gain for other in near if other.gain is not None]
+        held.append(replace(view, gain=torch.stack(gains).log().mean(dim=0).exp() if gains else None))
+    return replace(photos, views=views, held=held), light
+
+
+def _number(name: str, other: str, views: Sequence[Any]) -> int:
+    """Photos between two names, in the order of names."""
+    names = sorted({view.name for view in views} | {name})
+    return names.index(other) - names.index(name)
+
+
+def _without(photos: Photos, names: Sequence[str]) -> Photos:
+    kept = [n for n, view in enumerate(photos.training) if view.name not in names]
+    return replace(photos, training=[photos.training[n] for n in kept], views=[photos.views[n] for n in kept])

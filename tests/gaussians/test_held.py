@@ -1,0 +1,39 @@
+"""Training with held rows: nothing but their colours changes, and nothing at all of what no photo sees."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from perception.config import load_config
+from perception.gaussians.model import from_points
+from perception.gaussians.train import Trainer
+from perception.gaussians.views import TrainingView
+
+HELD, BEHIND = 40, 10
+
+
+def test_held_rows_keep_all_but_their_colours() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (80, 3)) + np.array([0, 0, 4])
+    points[:BEHIND, 2] *= -1  # behind all cameras
+    gaussians = from_points(points, rng.integers(0, 255, (80, 3)).astype(np.uint8), feature_dim=4, seed=0, opacity=0.6)
+    gaussians.opacity_logits[5:HELD:3] = -9.0  # nearly transparent: they would be pruned
+    before = gaussians.rows(torch.arange(80))
+    K = torch.tensor([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]])
+    views = []
+    for n in range(3):
+        pose = torch.eye(4)
+        pose[0, 3] = 0.3 * n
+        photo = torch.from_numpy(rng.integers(0, 255, (32, 48, 3)).astype(np.uint8))
+        views.append(TrainingView(str(n), photo, None, K, pose))
+    config = load_config(None, ["train.iterations=200", "train.budget=200", "densify.every=20", "train.sh_degree=0"])
+    trainer = Trainer(gaussians, views, config, [], held=HELD)
+    trainer.run()
+    after = trainer.gaussians
+    assert len(after) > HELD
+    for name, tensor in before.named().items():
+        same = (after.named()[name][:HELD] == tensor[:HELD]).flatten(1 if tensor.ndim > 1 else 0)
+        assert name == "sh" or bool(same.all()), name
+    assert torch.equal(after.sh[:BEHIND], before.sh[:BEHIND])
+    assert not torch.equal(after.sh[BEHIND:HELD], before.sh[BEHIND:HELD])

@@ -1,0 +1,53 @@
+"""Signs of a thing in photos whose depths and masks are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from perception.gaussians.views import TrainingView
+from perception.visits.evidence import signs_of
+from perception.visits.look import Look, in_view
+
+SHAPE = 40, 50
+BOX = np.s_[10:30, 10:40]
+
+
+def shown(measured: float, *, same: bool = True, cover: int = 0) -> Look:
+    """A photo of a thing in BOX at a depth of 2, where `measured` was measured; cover: its columns behind another."""
+    rng = np.random.default_rng(0)
+    inside = np.zeros(SHAPE, bool)
+    inside[BOX] = True
+    depth = np.full(SHAPE, measured)
+    depth[:, 10 : 10 + cover] = 1.0
+    labels = torch.from_numpy(np.where(inside & (depth > 1), 3, 1))
+    view = TrainingView("a", torch.zeros(*SHAPE, 3, dtype=torch.uint8), labels, torch.eye(3), torch.eye(4))
+    variance = rng.uniform(0.01, 0.02, SHAPE)
+    product = variance * (0.9 if same else 0.1)
+    return Look(view, np.full(SHAPE, 2.0), depth, np.where(inside, 7, -1), product, variance, variance, 0.1 * variance)
+
+
+def test_a_thing_that_stands_there_a_thing_that_is_gone_and_a_hidden_one() -> None:
+    still, gone = (
+        signs_of([look], [7], np.ones(1), np.array([0.1]))[0] for look in (shown(2.0), shown(3.0, same=False))
+    )
+    assert still.hit == 1 and still.through == 0 and still.outline == 1 and still.correlation == pytest.approx(0.9)
+    assert gone.through == 1 and gone.hit == 0 and gone.correlation == pytest.approx(0.1)
+    assert still.log_odds > 3 and gone.log_odds < -3
+    hidden = signs_of([shown(2.0, cover=30)], [7], np.zeros(1), np.array([0.1]))[0]
+    assert hidden.pixels == 0 and not hidden.seen
+
+
+def test_what_stands_in_front_is_not_looked_at() -> None:
+    half = signs_of([shown(2.0, cover=15)], [7], np.ones(1), np.array([0.1]))[0]
+    assert half.pixels == 20 * 15 and half.outline == 1 and half.hit == 1
+
+
+def test_the_gaussians_in_view_are_those_that_project_into_it() -> None:
+    view = TrainingView(
+        "a", torch.zeros(20, 40, 3, dtype=torch.uint8), None, torch.tensor([[10.0, 0, 20], [0, 10, 10], [0, 0, 1]]),
+        torch.eye(4),
+    )  # fmt: skip
+    means = np.array([[0, 0, 1.0], [1.9, 0, 1], [2.5, 0, 1], [0, 0, -1], [2.5, 0, 1]])
+    assert in_view(means, np.array([0.01, 0.01, 0.01, 0.01, 0.2]), [view]).tolist() == [True, True, False, False, True]

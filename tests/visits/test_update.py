@@ -1,0 +1,127 @@
+"""`perception update` on a made visit, against its exact truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from perception.config import load_config
+from perception.errors import InputError
+from perception.io.cloud import read_cloud
+from perception.map.history import changes_of
+from perception.map.write import Map, read_map
+from perception.pipeline.mapping import build_map
+from perception.visits.scene import update_settings
+from perception.visits.update import update_map
+from worlds.visits import make_visits
+
+pytestmark = pytest.mark.slow
+SHARE = {"moved": 0.0, "turned": 0.0, "removed": 0.2, "added": 0.1}
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two visits of a table, and the map of the first."""
+    folder = tmp_path_factory.mktemp("visits")
+    size = {"views": 24, "later_views": 14, "width": 200, "height": 150, "light_samples": 2, "seed": 3}
+    make_visits(folder, visits=2, share=SHARE, **size)
+    first = folder / "visit0"
+    settings = ["train.iterations=500", "language.encoder=none", "language.texts=off"]
+    build_map(first, folder / "old.gsmap", load_config(None, [f"masks=labels:{first / 'labels'}", *settings]))
+    return folder
+
+
+def updated(world: Path, name: str) -> Map:
+    """The map of the second visit."""
+    old, second = world / "old.gsmap", world / "visit1"
+    config = update_settings(old, None, [f"masks=labels:{second / 'labels'}"])
+    update_map(old, second, world / name, config)
+    return read_map(world / name)
+
+
+@pytest.fixture(scope="module")
+def new(world: Path) -> Map:
+    return updated(world, "new.gsmap")
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {file.name: file.read_bytes() for file in sorted(folder.iterdir()) if file.name != "report.html"}
+
+
+def thing_of(gmap: Map, instance: int, folder: Path) -> int:
+    """The true thing that most of an instance's Gaussians lie on."""
+    cloud = read_cloud(folder / "gt_points.ply")
+    nearest = cKDTree(cloud.points).query(gmap.means[gmap.instance_ids == instance])[1]
+    return int(np.bincount(cloud.labels["instance_id"][nearest]).argmax())
+
+
+def test_states_are_the_true_ones(world: Path, new: Map) -> None:
+    old = read_map(world / "old.gsmap")
+    true = {e["id"]: e for e in json.loads((world / "visit1" / "changes.json").read_text())["instances"]}
+    said: dict[str, list[str]] = {"removed": [], "unchanged": []}
+    for change in changes_of(new.info, new.instances, 0):
+        if change["state"] == "added":
+            continue
+        entry = true[thing_of(old, change["instance_id"], world / "visit0")]
+        if not entry["is_stuff"]:
+            said.setdefault(entry["state"], []).append(change["state"])
+    assert said["removed"] and set(said["removed"]) <= {"removed", "moved"}
+    assert said["unchanged"].count("unchanged") == len(said["unchanged"]) > 5
+    added = [c["instance_id"] for c in changes_of(new.info, new.instances, 0) if c["state"] == "added"]
+    assert added and {true[thing_of(new, i, world / "visit1")]["state"] for i in added} <= {"added"}
+
+
+def test_what_stays_keeps_its_ids_and_its_geometry(world: Path, new: Map) -> None:
+    """Every Gaussian of the old map that is still there has the same bits, but for its colours."""
+    old = read_map(world / "old.gsmap")
+    gone = {e["id"] for e in new.instances if e["state"] == "removed"}
+    names = ("means", "quats", "log_scales", "opacity_logits", "features")
+    rows = {b"".join(getattr(new, n)[i].tobytes() for n in names): int(new.instance_ids[i]) for i in range(len(new))}
+    stays = [i for i in range(len(old)) if old.instance_ids[i] not in gone]
+    found = [rows.get(b"".join(getattr(old, n)[i].tobytes() for n in names)) for i in stays]
+    assert found == old.instance_ids[stays].tolist()
+
+
+def test_an_update_is_repeatable_and_leaves_the_old_map(world: Path, new: Map) -> None:
+    before = content(world / "old.gsmap")
+    updated(world, "again.gsmap")
+    one, other = content(world / "new.gsmap"), content(world / "again.gsmap")
+    assert content(world / "old.gsmap") == before
+    assert one.keys() == other.keys()
+    assert all(one[name] == other[name] for name in one if name != "map.json")  # which holds seconds
+
+
+def test_a_visit_without_changes_adds_nothing(world: Path) -> None:
+    first = world / "visit0"
+    config = update_settings(world / "old.gsmap", None, [f"masks=labels:{first / 'labels'}"])
+    gmap = update_map(world / "old.gsmap", first, world / "same.gsmap", config)
+    assert {entry["state"] for entry in gmap.instances} <= {"unchanged", "unseen"}
+
+
+def test_another_scene_and_other_masks_are_refused(world: Path, small_scene: Path) -> None:
+    old = world / "old.gsmap"
+    before = content(old)
+    config = update_settings(old, None, [f"masks=labels:{small_scene / 'labels'}"])
+    with pytest.raises(InputError, match="do not show"):
+        update_map(old, small_scene, world / "no.gsmap", config)
+    with pytest.raises(InputError, match="come from labels"):
+        update_map(old, world / "visit1", world / "no.gsmap", config.model_copy(update={"masks": "builtin"}))
+    with pytest.raises(InputError, match="give labels:DIR"):
+        update_settings(old, None, [])
+    assert content(old) == before and not (world / "no.gsmap").exists()
+
+
+def test_the_truth_of_a_visit_agrees_with_its_pictures(world: Path) -> None:
+    """Things taken away are in no mask, and all others that changes.json says are seen are in one."""
+    listed = json.loads((world / "visit1" / "changes.json").read_text())["instances"]
+    seen = {int(i) for f in (world / "visit1" / "masks_gt").iterdir() for i in np.unique(cv2.imread(str(f), -1))}
+    for entry in listed:
+        if entry["state"] == "removed":
+            assert entry["id"] not in seen
+        elif entry["seen_in_visit2"] > 0.05:
+            assert entry["id"] in seen

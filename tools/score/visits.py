@@ -1,0 +1,214 @@
+"""Scores what `perception update` says about a second visit, on scenes with exact truth, against two maps made apart.
+
+python tools score.visits VISIT1 VISIT2 WORK [--masks labels|labels_sam|builtin] [--set KEY=VALUE ...]
+
+VISIT1 and VISIT2 are truth folders, as `worlds.visits` writes them; VISIT2 holds changes.json. The maps of both are
+made in WORK, and kept. Two tables: `update` of the first map; and the naive way, in which instances of the two maps are
+matched by place and size. An instance is the thing that it shares an IoU > .5 of true points with. A thing of which the
+second visit sees under 5 % is unseen; under 25 %, both its state and unseen are right.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.config import MapConfig, load_config
+from perception.io.cloud import read_cloud
+from perception.map.history import changes_of
+from perception.map.write import Map, read_map
+from perception.pipeline.mapping import build_map
+from perception.progress import Progress
+from perception.visits.scene import update_settings
+from perception.visits.update import update_map
+
+STATES = ("unchanged", "moved", "removed", "unseen", "added")
+CHANGED = ("moved", "removed", "added")
+UNSEEN, PARTLY = 0.05, 0.25
+NEAR = 0.05
+"""Metres between the centres of two instances of one thing, in the naive way; sizes within a factor of 1.5."""
+
+
+@dataclass
+class Truth:
+    """points [P, 3] and ids [P] of each visit; entries of changes.json by id, things alone."""
+
+    points: tuple[np.ndarray, np.ndarray]
+    ids: tuple[np.ndarray, np.ndarray]
+    entries: dict[int, dict[str, Any]]
+
+    @classmethod
+    def read(cls, first: Path, second: Path) -> Truth:
+        clouds = [read_cloud(folder / "gt_points.ply") for folder in (first, second)]
+        listed = json.loads((second / "changes.json").read_text(encoding="utf-8"))["instances"]
+        entries = {entry["id"]: entry for entry in listed if not entry["is_stuff"]}
+        points, ids = ([cloud.points for cloud in clouds], [cloud.labels["instance_id"] for cloud in clouds])
+        return cls((points[0], points[1]), (ids[0], ids[1]), entries)
+
+    def right(self, thing: int) -> tuple[str, set[str]]:
+        """The true state of a thing, and all states that are right."""
+        entry = self.entries[thing]
+        state = {"replaced": "removed"}.get(entry["state"], entry["state"])
+        seen, old = entry["seen_in_visit2"], entry.get("old_place_seen_in_visit2", 0.0)
+        if state == "moved" and seen < UNSEEN:
+            return ("unseen", {"unseen"}) if old < UNSEEN else ("removed", {"removed", "moved"})
+        if seen < UNSEEN and state != "added":
+            return "unseen", {"unseen"}
+        return state, {state, "unseen"} if seen < PARTLY and state != "added" else {state}
+
+
+def owners(gmap: Map, points: np.ndarray, true: np.ndarray) -> dict[int, int]:
+    """By thing: the instance of the map with an IoU > .5 on the true points."""
+    from scipy.spatial import cKDTree
+
+    held = gmap.instance_ids >= 0
+    distance, nearest = cKDTree(gmap.means[held]).query(points)
+    label = np.where(distance < 4 * np.median(distance), gmap.instance_ids[held][nearest], -1)
+    found = {}
+    for instance in np.unique(label[label >= 0]).tolist():
+        mine = label == instance
+        things, counts = np.unique(true[mine], return_counts=True)
+        thing, both = int(things[counts.argmax()]), int(counts.max())
+        if both > 0.5 * (mine.sum() + (true == thing).sum() - both):
+            found[thing] = instance
+    return found
+
+
+def scores(changes: list[dict[str, Any]], first: Map, second: Map, truth: Truth) -> dict[str, Any]:
+    """Precision, recall and F1 of each state; false alarms, unseen things called removed, errors of motions, ids."""
+    before, after = owners(first, truth.points[0], truth.ids[0]), owners(second, truth.points[1], truth.ids[1])
+    said = {change["instance_id"]: change for change in changes if change["state"] != "added"}
+    added = {change["instance_id"] for change in changes if change["state"] == "added"}
+    right, wrong, true = (dict.fromkeys(STATES, 0) for _ in range(3))
+    alarms, lost, errors, kept, unchanged, unseen = 0, 0, [], [], 0, 0
+    for thing in truth.entries:
+        state, allowed = truth.right(thing)
+        if state == "added":
+            if truth.entries[thing]["seen_in_visit2"] >= UNSEEN and (truth.ids[1] == thing).any():
+                true["added"] += 1
+                right["added"] += after.get(thing) in added
+            continue
+        if not (truth.ids[0] == thing).any():
+            continue
+        told = said.get(before.get(thing, -1), {"state": None})
+        new_alarm = after.get(thing) in added
+        wrong["added"] += new_alarm
+        true[state] += not (told["state"] in allowed and told["state"] != state)
+        if told["state"] == state:
+            right[state] += 1
+        elif told["state"] is not None and told["state"] not in allowed:
+            wrong[told["state"]] += 1
+        if state == "unchanged" and thing in before:
+            unchanged += 1
+            alarms += told["state"] in ("moved", "removed") or new_alarm
+            kept += [before[thing] == after[thing]] if thing in after else []
+        if state == "unseen" and thing in before:
+            unseen += 1
+            lost += told["state"] == "removed"
+        if told["state"] == "moved" and told.get("transform") and truth.entries[thing]["transform"]:
+            errors.append(
+                _error(np.array(told["transform"]), np.array(truth.entries[thing]["transform"]), thing, truth)
+            )
+    table = {
+        state: {
+            "precision": right[state] / max(1, right[state] + wrong[state]),
+            "recall": right[state] / max(1, true[state]),
+            "f1": 2 * right[state] / max(1, right[state] + wrong[state] + true[state]),
+            "true": true[state],
+        }
+        for state in STATES
+    }
+    median = np.median(errors, axis=0).tolist() if errors else [None, None]
+    return {
+        "states": table,
+        "f1": float(np.mean([table[state]["f1"] for state in CHANGED if table[state]["true"]] or [0])),
+        "false_alarms": alarms / max(1, unchanged), "unseen_called_removed": lost / max(1, unseen),
+        "motion_cm": median[0], "motion_degrees": median[1], "ids_kept": float(np.mean(kept)) if kept else None,
+    }  # fmt: skip
+
+
+def _error(found: np.ndarray, true: np.ndarray, thing: int, truth: Truth) -> tuple[float, float]:
+    """Centimetres at the thing's centre, and degrees."""
+    centre = truth.points[0][truth.ids[0] == thing].mean(axis=0)
+    shift = (found - true)[:3, :3] @ centre + (found - true)[:3, 3]
+    cosine = (np.trace(found[:3, :3] @ true[:3, :3].T) - 1) / 2
+    return 100 * float(np.linalg.norm(shift)), float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def naive(first: Map, second: Map) -> list[dict[str, Any]]:
+    """Changes between two maps made apart, whose instances are the same where place and size agree."""
+    from scipy.optimize import linear_sum_assignment
+
+    def facts(gmap: Map) -> tuple[np.ndarray, np.ndarray]:
+        centres = np.array([entry["centroid"] for entry in gmap.instances]).reshape(-1, 3)
+        return centres, np.array([np.linalg.norm(entry["obb"]["extent"]) for entry in gmap.instances])
+
+    (a, size_a), (b, size_b) = facts(first), facts(second)
+    distance = np.linalg.norm(a[:, None] - b[None], axis=2)
+    alike = np.abs(np.log(size_a[:, None] / size_b[None])) < np.log(1.5)
+    changes, free_a, free_b = [], set(range(len(a))), set(range(len(b)))
+    for reach, state in ((NEAR, "unchanged"), (np.inf, "moved")):
+        cost = np.where(alike & (distance < reach), distance, 1e6)
+        cost[sorted(set(range(len(a))) - free_a)] = cost[:, sorted(set(range(len(b))) - free_b)] = 1e6
+        for i, j in zip(*linear_sum_assignment(cost), strict=True):
+            if cost[i, j] < 1e6:
+                free_a, free_b = free_a - {i}, free_b - {j}
+                changes.append({"state": state, "instance_id": first.instances[i]["id"], "new_centroid": b[j].tolist()})
+    changes += [{"state": "removed", "instance_id": first.instances[i]["id"]} for i in sorted(free_a)]
+    return changes + [{"state": "added", "instance_id": second.instances[j]["id"]} for j in sorted(free_b)]
+
+
+def show(name: str, result: dict[str, Any]) -> None:
+    print(f"{name}: mean F1 of moved, removed and added {result['f1']:.3f}")
+    for state, row in result["states"].items():
+        print(f"  {state:10s} P {row['precision']:.2f}  R {row['recall']:.2f}  F1 {row['f1']:.2f}  of {row['true']}")
+    rest = {key: value for key, value in result.items() if key not in ("states", "f1")}
+    print("  " + ", ".join(f"{key} {value:.3f}" if value is not None else f"{key} –" for key, value in rest.items()))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    for name in ("first", "second", "work"):
+        parser.add_argument(name, type=Path)
+    parser.add_argument("--masks", choices=("labels", "labels_sam", "builtin"), default="labels")
+    parser.add_argument("--set", action="append", default=[], dest="pairs")
+    given = parser.parse_args()
+    given.work.mkdir(parents=True, exist_ok=True)
+    seconds: dict[str, float] = {}
+
+    def masks(folder: Path) -> str:
+        return "masks=builtin" if given.masks == "builtin" else f"masks=labels:{folder / given.masks}"
+
+    def mapped(folder: Path, output: Path) -> Map:
+        config: MapConfig = load_config(None, [*given.pairs, masks(folder)])
+        start = time.monotonic()
+        made = read_map(output) if output.exists() else build_map(folder, output, config, progress=Progress())
+        seconds[output.stem] = round(time.monotonic() - start, 1)
+        return made
+
+    first, apart = (
+        mapped(folder, given.work / f"{name}.gsmap")
+        for folder, name in ((given.first, "first"), (given.second, "apart"))
+    )
+    output, start = given.work / "today.gsmap", time.monotonic()
+    if not output.exists():
+        config = update_settings(given.work / "first.gsmap", None, [masks(given.second)])
+        update_map(given.work / "first.gsmap", given.second, output, config, progress=Progress())
+    today = read_map(output)
+    seconds["today"] = round(time.monotonic() - start, 1)
+    truth = Truth.read(given.first, given.second)
+    show("update", scores(changes_of(today.info, today.instances, 0), first, today, truth))
+    show("two maps made apart", scores(naive(first, apart), first, apart, truth))
+    figures = [(name, gmap.info["quality"].get("psnr")) for name, gmap in (("update", today), ("new map", apart))]
+    print("held-out PSNR: " + ", ".join(f"{name} {psnr:.2f} dB" for name, psnr in figures if psnr is not None))
+    print(f"seconds: {seconds}")
+
+
+if __name__ == "__main__":
+    main()
