@@ -117,12 +117,13 @@ def _shown(
         view = training_view(located[n], side)
         height, width = view.photo.shape[:2]
         seen = render_silhouettes(gaussians, [positions], view.camera_from_world, view.K, width, height)[0]
+        shown = seen.ids.copy()
         for entry in entries:
             row, name = rank[entry["id"]], gmap.views[n].name
             if name in descriptions[row].views and stood(entry, getattr(gmap.views[n], "visit", 0)) is not entry:
                 x0, y0, x1, y1 = descriptions[row].boxes[descriptions[row].views.index(name)]
-                seen.ids[seen.ids == row] = -1
-                seen.ids[y0:y1, x0:x1] = row
-        return view.photo.numpy(), seen.ids
+                shown[shown == row] = -1
+                shown[y0:y1, x0:x1] = row
+        return view.photo.numpy(), shown
 
     return [np.array([number[name] for name in d.views], np.int64) for d in descriptions], load

@@ -104,7 +104,7 @@ class Core:
         engine.on_reload(lambda _: self._submit(self._send_map))
 
     def start(self) -> None:
-        """Publishes the map's changes and its point cloud."""
+        """Publishes the map's point cloud and its changes."""
         self._submit(self._send_map)
 
     # ------------------------------------------------------------------ topics
@@ -206,12 +206,12 @@ class Core:
         with self._sending_map:
             if gmap is not self._engine.current:  # a newer map is published soon
                 return
-            if gmap.visits:
-                facts = {**gmap.changes_json(), "map_id": gmap.map_id}
-                self._send_json({**facts, "stamp": answers.stamp_json(self._stamps.next())}, answers.CHANGES)
             if self._config.map_points:
                 cloud = answers.map_cloud(gmap, self._config.map_points, self._stamps.next())
                 self._transport.publish(answers.MAP_CLOUD, cloud)
+            if gmap.visits:
+                facts = {**gmap.changes_json(), "map_id": gmap.map_id}
+                self._send_json({**facts, "stamp": answers.stamp_json(self._stamps.next())}, answers.CHANGES)
 
     def _submit(self, work: Callable[[QueryMap], None]) -> None:
         """Runs work on the map in a thread of the engine, or in the calling thread when the request queue is full."""
