@@ -29,6 +29,10 @@ LEAST_POINTS = 100
 CELLS = 64
 """Cells along a side of the photo in which the nearest visible point is what is known before."""
 
+PATCH, FLAT = 7, 0.5
+"""Side of a patch in pixels; standard deviation of grey levels below which it shows nothing but rounding,
+and its depth is a guess: worth 0.5 dB and 4 dB in the worst view (every 6th photo of a bonsai)."""
+
 
 def with_stereo(
     views: Sequence[View], decoded: list[TrainingView], points: np.ndarray, progress: Progress = QUIET
@@ -51,12 +55,19 @@ def with_stereo(
     found = []
     for photo, stereo in zip(decoded, made, strict=True):
         if stereo is not None:
-            kept = without_edges(stereo.depth) * stereo.confirmed
+            kept = without_edges(stereo.depth) * (stereo.confirmed & _textured(stereo.grey))
             depth = cv2.resize(kept.astype(np.float32), photo.photo.shape[1::-1], interpolation=cv2.INTER_NEAREST)
             depth *= 1 if photo.weight is None else photo.weight.numpy() > 0
             photo = replace(photo, depth=torch.from_numpy(depth), measured=False).stored()
         found.append(photo)
     return found
+
+
+def _textured(grey: np.ndarray) -> np.ndarray:
+    """[h, w] bool: whether the patch around each pixel of grey [h, w] uint8 shows something that stereo can match."""
+    levels = grey.astype(np.float32)
+    variance = cv2.blur(levels * levels, (PATCH, PATCH)) - cv2.blur(levels, (PATCH, PATCH)) ** 2
+    return np.asarray(variance > FLAT**2)
 
 
 def _prior(view: View, points: np.ndarray) -> np.ndarray:

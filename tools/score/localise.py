@@ -28,7 +28,7 @@ from perception.frame.recentre import map_from_input, moved
 from perception.geometry import camera_centres, inverse_se3
 from perception.inputs.load import load_scene
 from perception.inputs.readers import reader_of
-from perception.inputs.transforms import transforms_file
+from perception.inputs.transforms import transforms_files
 from perception.localise.localiser import Localised, Localiser, NotHere
 from perception.localise.photos import NO_POINTS, new_photos
 from perception.map.map import Map
@@ -49,7 +49,7 @@ def truth_of(source: Path, workdir: Path) -> list[View]:
 
 def split(known: Path, every: int, workdir: Path) -> tuple[Path, Path]:
     """Two files: the frames of a transforms.json without every N-th by name, and these."""
-    file = transforms_file(known)
+    file = transforms_files(known)[0]
     data = json.loads(file.read_text())
     frames = sorted(data["frames"], key=lambda frame: str(frame["file_path"]))
     for frame in frames:
