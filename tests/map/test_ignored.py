@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from perception.errors import InputError
+from perception.map.files import MapFiles
+from perception.map.model import check_facts
 from perception.map.write import read_map, verify_map, write_map
 from support.viewer_maps import small_map
 
@@ -25,6 +26,6 @@ def test_the_mask_of_still_things_is_written_and_kept(tmp_path: Path) -> None:
     write_map(tmp_path / "again.gsmap", read_map(tmp_path / "m.gsmap"))
     assert (tmp_path / "again.gsmap" / "ignored.png").read_bytes() == png
     assert verify_map(tmp_path / "again.gsmap")["ignored.png"] == "ok"
-    with pytest.raises(InputError, match="mask"):
-        write_map(tmp_path / "bad.gsmap", replace(gmap, info={**gmap.info, "scene": {"still": {**still, "mask": "§"}}}))
-        read_map(tmp_path / "bad.gsmap")
+    facts = {**MapFiles(tmp_path / "m.gsmap").facts, "scene": {"still": {**still, "mask": "§"}}}
+    with pytest.raises(ValueError, match=r"scene\.still\.mask"):
+        check_facts(facts)
