@@ -4,11 +4,12 @@ read. Ids and counts are 0 … 2³¹ − 1. Keys that are not named here are kep
 
 from __future__ import annotations
 
+import base64
 import json
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Base64Bytes, Field
+from pydantic import AfterValidator, Field
 
 from perception.io.json_shapes import (
     Bytes,
@@ -34,6 +35,12 @@ PREFIX = "language_"
 Arrays = dict[str, np.ndarray]
 
 
+def _encoded(value: str) -> str:
+    base64.b64decode(value, validate=True)  # a ValueError for anything else
+    return value
+
+
+Encoded = Annotated[str, AfterValidator(_encoded)]
 _QUALITY = {
     "psnr?": Number | None, "ssim?": Number | None,
     "views?": dict[str, typed({"psnr": Number | None, "ssim": Number | None})],  # type: ignore[misc]
@@ -55,7 +62,7 @@ FACTS = typed({
     },
     "scene?": {
         "origin?": Point, "input?": PathText, "left_out?": [{"name": PathText, "why": PathText}],
-        "warnings?": list[PathText], "still?": {"photos": Count, "share": Share, "mask": Base64Bytes},
+        "warnings?": list[PathText], "still?": {"photos": Count, "share": Share, "mask": Encoded},
     },
     "masks?": {"warnings?": list[PathText]},
     "instances?": {"texts?": Any},
