@@ -157,6 +157,9 @@ def test_the_walkthrough_runs(small_scene: Path, tmp_path: Path, monkeypatch: py
         if words[0] == "map":
             words = [str(small_scene / "transforms.json") if word == "PHOTOS" else word for word in words]
             words += shlex.split(small)
+        if words[0] == "update":
+            words = [str(small_scene / "transforms.json") if word == "NEW_PHOTOS" else word for word in words]
+            words += ["--masks", f"labels:{small_scene / 'labels'}"]
         if words[0] == "relink":
             words = [str(small_scene / "images") if word == "DIR" else word for word in words]
         if words[0] == "label":  # the id of an instance that this map has
