@@ -155,7 +155,7 @@ def test_on_ros(engine: QueryEngine, folder: Path) -> None:
     served._made(engine.current, folder / "photos").result(300)
     heard = Heard()
     node = Localising(engine, heard, NodeConfig(photos=str(folder / "photos")))
-    info = {"k": CAMERA["camera_matrix"], "d": [0.0] * 5, "distortion_model": "plumb_bob"}
+    info = {"k": CAMERA["camera_matrix"], "d": [0.0] * 5, "p": [], "distortion_model": "plumb_bob"}
     node.camera(SimpleNamespace(width=400, height=300, **info))
     node.image(image_of(folder / "photos/new.png"))
     answer = heard.answer()

@@ -125,7 +125,7 @@ def test_labels_engine_and_http_answer_alike(world: dict[str, Any]) -> None:
 def test_shell_lines_do_what_they_say(kitchen: Path, tmp_path: Path) -> None:
     lines = [line for kind, code in SNIPPETS if kind == "sh" for line in code.strip().splitlines()]
     commands = [shlex.split(line)[1:] for line in lines if line.startswith("perception ")]
-    assert [build_parser().parse_args(words).command for words in commands] == ["serve", "mcp", "mcp"]
+    assert [build_parser().parse_args(words).command for words in commands] == [*2 * ["localise"], "serve", "mcp", "mcp"]
     if shutil.which("curl") is None or shutil.which("bash") is None:
         pytest.skip("no curl here")
     out = []

@@ -1,4 +1,4 @@
-"""Scores what `perception update` says about a second visit, on scenes with exact truth, against two maps made apart.
+"""Scores what `perception update` says of a second visit with exact truth, beside two maps made apart.
 
 python tools score.visits VISIT1 VISIT2 WORK [--masks labels|labels_sam|builtin] [--set KEY=VALUE ...]
 
