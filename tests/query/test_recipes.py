@@ -125,7 +125,8 @@ def test_labels_engine_and_http_answer_alike(world: dict[str, Any]) -> None:
 def test_shell_lines_do_what_they_say(kitchen: Path, tmp_path: Path) -> None:
     lines = [line for kind, code in SNIPPETS if kind == "sh" for line in code.strip().splitlines()]
     commands = [shlex.split(line)[1:] for line in lines if line.startswith("perception ")]
-    assert [build_parser().parse_args(words).command for words in commands] == [*2 * ["localise"], "serve", "mcp", "mcp"]
+    named = [build_parser().parse_args(words).command for words in commands]
+    assert named == ["localise", "localise", "serve", "mcp", "mcp"]
     if shutil.which("curl") is None or shutil.which("bash") is None:
         pytest.skip("no curl here")
     out = []
@@ -136,5 +137,5 @@ def test_shell_lines_do_what_they_say(kitchen: Path, tmp_path: Path) -> None:
             out.append(done.stdout)
     assert json.loads(out[0])["results"][0]["hits"][0]["instance_id"] == 0
     assert json.loads(out[1])["hits"][0]["instance_id"] == 0 and len(json.loads(out[1])["hits"]) == 2
-    assert json.loads(out[3])["status"] == "ok"
+    assert json.loads(out[4])["status"] == "ok"
     assert len(read_cloud(tmp_path / "mug.ply").points) == json.loads(out[0])["results"][0]["hits"][0]["num_points"]

@@ -1,4 +1,4 @@
-"""Scores structure from motion on thinned sets of photos beside pycolmap: registered, wrong, errors, seconds.
+"""Scores structure from motion on thinned sets of photos beside pycolmap: registered, wrong, errors
 
 Runs one way over the sets that WORK has no result of, then prints a row for each set, with columns for each way that
 WORK knows. Poses are compared after a similarity; a wrong one is off by more than 5° or a tenth of the cameras' spread.
