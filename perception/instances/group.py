@@ -120,10 +120,12 @@ def _parted_by_masks(
     """segment_of [N] (−1 = none), where Gaussians whose masks disagree with their segment form segments of their own.
 
     A coin on a table has so few Gaussians that the table's segments take them in. ROUNDS times, those that are left
-    over are cut anew, each time into smaller segments.
+    over are cut anew, each time into smaller segments. What is mostly seen where no mask is stays where it is.
     """
+    shown = [np.asarray(table.sum(axis=1)).reshape(-1) for table in (votes.pixels, votes.void)]
+    masked = (segment_of >= 0) & (shown[0] > shown[1])
     for size in (PER_SEGMENT >> n for n in range(ROUNDS)):
-        apart = np.flatnonzero((segment_of >= 0) & (memberships(segment_of, votes) < LEAST_AGREEMENT))
+        apart = np.flatnonzero(masked & (memberships(segment_of, votes) < LEAST_AGREEMENT))
         if len(apart) < LEAST:
             break
         segment_of = segment_of.copy()

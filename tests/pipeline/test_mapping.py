@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -131,7 +132,8 @@ def test_the_report_is_one_page_that_needs_nothing_else(finished: Path, tmp_path
     out = tmp_path / "report.html"
     assert main(["report", str(finished), "-o", str(out), "--ask", "a ball"]) == 0
     page = out.read_text()
-    assert "http" not in page.replace("http://www.w3.org", "")
+    text = re.sub(r"base64,[A-Za-z0-9+/=]+", "", page)  # in which four letters may stand by chance
+    assert "http" not in text.replace("http://www.w3.org", "")
     assert page.count("data:image") > len(read_map(finished).instances) // 2
 
 
