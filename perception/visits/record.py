@@ -80,7 +80,7 @@ def recorded(entry: dict[str, Any], visit: int, signs: Signs, motion: Motion | N
         entry = {key: value for key, value in entry.items() if key != "parts"}
         entry |= {"state": "removed", "confidence": round(sure, 3), "num_gaussians": 0}
     else:
-        entry |= {"state": "moved", "confidence": round(sure * probability(motion.signs.same), 3), "last_seen": visit}
+        entry |= {"state": "moved", "confidence": round(sure * probability(motion.odds), 3), "last_seen": visit}
     return {**entry, "last_looked_for": visit, "past": past}
 
 

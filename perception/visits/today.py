@@ -135,13 +135,14 @@ def _moved(
     for j, (own, _) in enumerate(things):
         new = grown.rows(torch.from_numpy(own))
         rest = grown.rows(torch.from_numpy(np.setdiff1d(np.arange(len(grown)), own)))
-        alike = np.argsort([looks_alike(olds[i], new) for i in gone], kind="stable")[::-1][:ALIKE]
-        guesses = {a: motions_of(olds[gone[a]], new, visit.frames, rest, up, depth[gone[a]]) for a in alike.tolist()}
+        alike = [looks_alike(olds[i], new) for i in gone]
+        likely = np.argsort(alike, kind="stable")[::-1][:ALIKE].tolist()
+        guesses = {a: motions_of(olds[gone[a]], new, visit.frames, rest, up, depth[gone[a]]) for a in likely}
         guesses = {a: guess for a, guess in guesses.items() if guess[0] and guess[0][0][0].same > HOPELESS}
         for a in sorted(guesses, key=lambda a: -guesses[a][0][0][0].same)[:LIKELY]:
-            motion = settled(olds[gone[a]], *guesses[a], depth[gone[a]])
-            odds[a, j], motions[a, j] = motion.signs.same, motion
-            if motion.signs.same > CERTAIN:
+            motion = settled(olds[gone[a]], *guesses[a], depth[gone[a]], alike[a])
+            odds[a, j], motions[a, j] = motion.odds, motion
+            if motion.odds > CERTAIN:
                 break
         visit.run.progress.update("motions", j + 1, len(things))
     pairs = {}
