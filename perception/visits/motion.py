@@ -48,10 +48,12 @@ TURNED = 15.0
 """Degrees from which two motions are different ones."""
 HOPELESS = -4.0
 """Log-odds of a first guess below which a motion is not refined."""
-ALIKE, LIKELY = 2, 2
-"""Old things, most alike in colour, with which a new one is compared; and of these, with which closely."""
+ALIKE = 2
+"""Old things, most alike in colour, with which a new one is compared."""
 CERTAIN = 4.0
-"""Log-odds of a motion from which no other thing is tried."""
+"""Log-odds of a motion from which no other thing is tried, unless that is as much alike."""
+TWINS = 0.15
+"""Difference of what two histograms have in common, within which two things are as much alike."""
 MOVED = 1.2
 """Least log-odds for which a new thing is an old one."""
 GAINS = 0.02
