@@ -48,10 +48,12 @@ TURNED = 15.0
 """Degrees from which two motions are different ones."""
 HOPELESS = -4.0
 """Log-odds of a first guess below which a motion is not refined."""
-ALIKE, LIKELY = 3, 2
-"""Old things, most alike in colour, with which a new one is compared; and of these, with which closely."""
+ALIKE = 2
+"""Old things, most alike in colour, with which a new one is compared."""
 CERTAIN = 4.0
-"""Log-odds of a motion from which no other thing is tried."""
+"""Log-odds of a motion from which no other thing is tried, unless that is as much alike."""
+TWINS = 0.15
+"""Difference of what two histograms have in common, within which two things are as much alike."""
 MOVED = 1.2
 """Least log-odds for which a new thing is an old one."""
 GAINS = 0.02
@@ -59,7 +61,10 @@ GAINS = 0.02
 ROUGH_STEP, STEP, LEAST_STEP = 0.4, 0.1, 0.015
 """Steps of a motion in refinement, from a rough one down: radii of the thing, and radians."""
 BINS = 6
-"""Of each colour in the histograms by which pairs are chosen."""
+"""Of each colour in the histograms of things."""
+LOOKS = 8.0, 0.45
+"""Log-odds of being one thing per unit of what two histograms have in common, and where that says nothing: the same
+things share .5 to .75 between visits, others up to .5."""
 CLOSE = 1.5
 """Log-odds within which two motions, or two look-alikes, cannot be told apart."""
 
@@ -103,16 +108,17 @@ class Points:
 
 @dataclass(frozen=True)
 class Motion:
-    """new_from_old [4, 4] of a thing; signs: of the photos for the thing carried there; ambiguous: another motion
-    explains them as well."""
+    """new_from_old [4, 4] of a thing; odds: log-odds that it is the same thing, by the photos and by its colours;
+    ambiguous: another motion explains the photos as well."""
 
     new_from_old: np.ndarray
-    signs: Signs
+    odds: float
     ambiguous: bool = False
 
 
 def register(old: Points, new: Points, up: np.ndarray) -> list[tuple[float, np.ndarray]]:
-    """(mean residual in radii of the old thing, new_from_old [4, 4]) of the best motions, the best first."""
+    """(mean residual in radii of the old thing, new_from_old [4, 4]) of the best motions, the best first, and of all
+    turns about the vertical that differ from them: points of a half hidden thing alone cannot tell."""
     from scipy.spatial import cKDTree
 
     radius = max(old.radius, 1e-9)
@@ -123,13 +129,13 @@ def register(old: Points, new: Points, up: np.ndarray) -> list[tuple[float, np.n
         start = np.eye(4)
         start[:3, :3], start[:3, 3] = rotation, middle_new - rotation @ middle_old
         starts.append(_icp(tree, old, new.some(ROUGH), start, radius, ROUNDS[0]))
-    starts.sort(key=lambda found: found[0])
-    fine = [_icp(tree, old, new.some(FINE), start, radius, ROUNDS[1]) for _, start in starts[: 2 * BEST]]
+    likely = sorted(starts, key=lambda found: found[0])[: 2 * BEST]
+    fine = [_icp(tree, old, new.some(FINE), start, radius, ROUNDS[1]) for _, start in likely]
     distinct: list[tuple[float, np.ndarray]] = []
-    for found in sorted(fine, key=lambda found: found[0]):
+    for found in [*sorted(fine, key=lambda found: found[0]), *starts[:YAWS]]:
         if all(angle_between(found[1], other[1]) > TURNED for other in distinct):
             distinct.append(found)
-    return distinct[:BEST]
+    return distinct
 
 
 def _starts(up: np.ndarray) -> list[np.ndarray]:
@@ -335,11 +341,13 @@ def _upright_starts(a: Points, b: Points, up: np.ndarray) -> list[np.ndarray]:
     return poses
 
 
-def settled(old: Gaussians, found: Sequence[Found], cuts: Sequence[Cut], depth: float) -> Motion:
-    """The best of the two best motions after refinement, and whether the other explains the photos as well."""
+def settled(old: Gaussians, found: Sequence[Found], cuts: Sequence[Cut], depth: float, alike: float) -> Motion:
+    """The best of the two best motions after refinement, and whether the other explains the photos as well. alike: see
+    `looks_alike`."""
     refine = _distinct([refined(old, pose, cuts, depth, STEP, LEAST_STEP) for _, pose in found[:2]])
     (signs, pose), others = refine[0], refine[1:]
-    return Motion(pose, signs, any(other.same > signs.same - CLOSE for other, _ in others))
+    odds = signs.same + LOOKS[0] * (alike - LOOKS[1])
+    return Motion(pose, odds, any(other.same > signs.same - CLOSE for other, _ in others))
 
 
 def judged(old: Gaussians, pose: np.ndarray, cuts: Sequence[Cut], depth: float) -> Signs:

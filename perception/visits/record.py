@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ def visit_record(source: Path, photos: Sequence[Path]) -> dict[str, Any]:
     """An entry of `visits` of map.json. time: when the newest photo was taken, else when its file was written."""
     taken = time_taken(photos)
     if taken is None and photos:
-        taken = datetime.fromtimestamp(max(photo.stat().st_mtime for photo in photos), UTC)
+        taken = datetime.fromtimestamp(max(photo.stat().st_mtime for photo in photos), timezone.utc)
     time = None if taken is None else taken.strftime("%Y-%m-%dT%H:%M:%SZ")
     return {"time": time, "input": str(source), "photos": len(photos)}
 
@@ -80,7 +80,7 @@ def recorded(entry: dict[str, Any], visit: int, signs: Signs, motion: Motion | N
         entry = {key: value for key, value in entry.items() if key != "parts"}
         entry |= {"state": "removed", "confidence": round(sure, 3), "num_gaussians": 0}
     else:
-        entry |= {"state": "moved", "confidence": round(sure * probability(motion.signs.same), 3), "last_seen": visit}
+        entry |= {"state": "moved", "confidence": round(sure * probability(motion.odds), 3), "last_seen": visit}
     return {**entry, "last_looked_for": visit, "past": past}
 
 

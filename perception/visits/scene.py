@@ -18,6 +18,8 @@ from perception.localise.localiser import Localised, Localiser
 from perception.localise.photos import new_photos
 from perception.map.files import read_info
 from perception.map.map import Map
+from perception.photos.folder import VIDEO_SUFFIXES
+from perception.photos.video import video_frames
 from perception.photos.views import make_view
 from perception.pipeline.checkpoint import frames_folder
 from perception.pipeline.optimise import Run
@@ -60,7 +62,11 @@ def visit_scene(run: Run, gmap: Map, output: Path) -> Scene:
     options = ReadOptions(run.work / "sfm", run.config.seed, run.progress, photos.strict, masks, camera)
     options = replace(options, frames=frames_folder(output), poses="keep", cloud=NO_CLOUD)
     if not reader_of(source).poses:
-        return _localised(run, gmap, camera)
+        photos_of = source
+        if source.suffix.lower() in VIDEO_SUFFIXES and source.is_file():
+            photos_of = frames_folder(output)
+            video_frames(source, photos_of, run.progress)
+        return _localised(run, gmap, photos_of, camera)
     scene = load_scene(source, options)
     if not scene.views:
         raise InputError(f"{source}: holds no posed photo; give photos of a new visit")
@@ -71,8 +77,8 @@ def visit_scene(run: Run, gmap: Map, output: Path) -> Scene:
     return replace(scene, views=[moved(view, b_from_a) for view in scene.views])
 
 
-def _localised(run: Run, gmap: Map, camera: Path | None) -> Scene:
-    found = new_photos([run.source], camera, run.work / "sfm", run.progress)
+def _localised(run: Run, gmap: Map, source: Path, camera: Path | None) -> Scene:
+    found = new_photos([source], camera, run.work / "sfm", run.progress)
     answers = Localiser(gmap, progress=run.progress).answers(found)
     here = [answer for answer in answers if isinstance(answer, Localised)]
     if len(here) < LEAST_SHARE * len(answers):

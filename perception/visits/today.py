@@ -29,8 +29,8 @@ from perception.visits.motion import (
     CERTAIN,
     CLOSE,
     HOPELESS,
-    LIKELY,
     MOVED,
+    TWINS,
     Motion,
     assigned,
     carried,
@@ -42,6 +42,11 @@ from perception.visits.visit import Visit, gaussians_of
 
 UP = (0.0, 0.0, 1.0)
 """Of a map that does not record gravity."""
+INSTEAD = 0.3
+"""Share of a new thing's pixels where the old map showed things that are gone, from which it was not there before."""
+FRAGMENT = 0.3, 3
+"""A new group of a score below, and of less than this many times the least Gaussians of a group, is a piece of what
+stands beside it, no thing; most things score .8 and more."""
 
 
 @dataclass
@@ -91,13 +96,20 @@ def seen_today(visit: Visit) -> Today:
         joined = joined_instances(votes, dense, rows)
         ids[rows] = np.append(known, -1)[joined]
         free = rows[joined < 0]
-        made = grouped(grown, votes, free, run.config)
-    things = [(free[made.ids == n], float(made.scores[n])) for n in range(made.count)]
+        made = _without_fragments(grouped(grown, votes, free, run.config), run.config.instances.min_cluster_size)
+    things = [(free[made.ids == n], float(made.scores[n])) for n in range(made.count) if (made.ids == n).any()]
     with run.stage("evidence"):
-        old = _shown_before(visit, before, grown, things)
+        old = _shown_before(visit, before, grown, things, gone)
     with run.stage("motion"):
         pairs = _moved(visit, grown, things, gone)
     return _settled(visit, grown, kept, ids, made, free, signs, gone, things, old, pairs, record)
+
+
+def _without_fragments(made: Grouping, least: int) -> Grouping:
+    """The grouping without what is small and in hardly any mask. least: Gaussians of a group."""
+    sizes = np.bincount(made.ids[made.ids >= 0], minlength=made.count)
+    fragments = np.flatnonzero((np.asarray(made.scores) < FRAGMENT[0]) & (sizes < FRAGMENT[1] * least))
+    return replace(made, ids=np.where(np.isin(made.ids, fragments), -1, made.ids))
 
 
 def _signs(visit: Visit, looks: list[Look]) -> list[Signs]:
@@ -109,16 +121,22 @@ def _signs(visit: Visit, looks: list[Look]) -> list[Signs]:
 
 
 def _shown_before(
-    visit: Visit, before: list[Look], grown: Gaussians, things: list[tuple[np.ndarray, float]]
+    visit: Visit, before: list[Look], grown: Gaussians, things: list[tuple[np.ndarray, float]], gone: list[int]
 ) -> set[int]:
-    """Numbers of the things that the old map shows as the photos do, `before`: it only did not know them as things."""
+    """Numbers of the things that the old map shows as the photos do, `before`: it only did not know them as things.
+    A thing in front of one that is `gone`, or in its place, is none of these."""
     ids = np.full(len(grown), -1, np.int32)
     for j, (rows, _) in enumerate(things):
         ids[rows] = j
     looks = [replace(old, ids=new.ids) for old, new in zip(before, visit.looks(grown, ids), strict=True)]
+    pixels, instead = np.zeros(len(things)), np.zeros(len(things))
+    for old, new in zip(before, looks, strict=True):
+        for mask, count in ((new.ids >= 0, pixels), ((new.ids >= 0) & np.isin(old.ids, gone), instead)):
+            count += np.bincount(new.ids[mask], minlength=len(things))
     anywhere = np.full(len(things), np.inf)  # what is in front of the old surface counts, too
     signs = signs_of(looks, range(len(things)), np.ones(len(things)), anywhere)
-    return {j for j, each in enumerate(signs) if each.photos and each.log_odds > 0}
+    fresh = instead > INSTEAD * pixels
+    return {j for j, each in enumerate(signs) if each.photos and each.log_odds > 0 and not fresh[j]}
 
 
 def _moved(
@@ -135,20 +153,22 @@ def _moved(
     for j, (own, _) in enumerate(things):
         new = grown.rows(torch.from_numpy(own))
         rest = grown.rows(torch.from_numpy(np.setdiff1d(np.arange(len(grown)), own)))
-        alike = np.argsort([looks_alike(olds[i], new) for i in gone], kind="stable")[::-1][:ALIKE]
-        guesses = {a: motions_of(olds[gone[a]], new, visit.frames, rest, up, depth[gone[a]]) for a in alike.tolist()}
-        guesses = {a: guess for a, guess in guesses.items() if guess[0] and guess[0][0][0].same > HOPELESS}
-        for a in sorted(guesses, key=lambda a: -guesses[a][0][0][0].same)[:LIKELY]:
-            motion = settled(olds[gone[a]], *guesses[a], depth[gone[a]])
-            odds[a, j], motions[a, j] = motion.signs.same, motion
-            if motion.signs.same > CERTAIN:
+        alike = [looks_alike(olds[i], new) for i in gone]
+        likely = np.argsort(alike, kind="stable")[::-1][:ALIKE].tolist()
+        for a in likely:
+            if odds[:, j].max() > CERTAIN and alike[a] < alike[likely[0]] - TWINS:
                 break
+            found, cuts = motions_of(olds[gone[a]], new, visit.frames, rest, up, depth[gone[a]])
+            if not found or found[0][0].same < HOPELESS:
+                continue
+            motion = settled(olds[gone[a]], found, cuts, depth[gone[a]], alike[a])
+            odds[a, j], motions[a, j] = motion.odds, motion
         visit.run.progress.update("motions", j + 1, len(things))
     pairs = {}
     for a, j in assigned(odds, MOVED):
         rivals = np.concatenate([np.delete(odds[:, j], a), np.delete(odds[a], j)])
-        alike = rivals.max(initial=-np.inf) > odds[a, j] - CLOSE
-        pairs[gone[a]] = (j, replace(motions[a, j], ambiguous=motions[a, j].ambiguous or bool(alike)))
+        unsure = rivals.max(initial=-np.inf) > odds[a, j] - CLOSE
+        pairs[gone[a]] = (j, replace(motions[a, j], ambiguous=motions[a, j].ambiguous or bool(unsure)))
     return pairs
 
 

@@ -10,7 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from perception.gaussians.model import Gaussians, isotropic
 from perception.gaussians.views import render
+from perception.instances.group import Grouping
 from perception.visits.motion import Points, angle_between, assigned, carried, register
+from perception.visits.today import _without_fragments
 from support.aimed import look_at
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -77,3 +79,11 @@ def test_pairs_have_the_largest_sum_of_log_odds() -> None:
         best = max(sum(max(0.0, odds[i, j] - 1) for i, j in enumerate(order)) for order in permutations(range(4)))
         pairs = assigned(odds, 1.0)
         assert np.isclose(sum(odds[i, j] - 1 for i, j in pairs), best) and all(odds[i, j] > 1 for i, j in pairs)
+
+
+def test_small_groups_in_hardly_any_mask_are_no_things() -> None:
+    sizes = [200, 60, 50]
+    ids = np.repeat(np.arange(3), sizes).astype(np.int32)
+    none = np.full(len(ids), -1, np.int32)
+    made = _without_fragments(Grouping(ids, np.ones(len(ids)), np.array([0.1, 0.9, 0.1]), none), 32)
+    assert np.bincount(made.ids[made.ids >= 0], minlength=3).tolist() == [200, 60, 0]

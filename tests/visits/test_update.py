@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import cv2
@@ -10,11 +15,13 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from perception.cli import main
 from perception.config import load_config
 from perception.errors import InputError
 from perception.io.cloud import read_cloud
 from perception.map.history import changes_of
 from perception.map.write import Map, read_map
+from perception.pipeline.checkpoint import work_folder
 from perception.pipeline.mapping import build_map
 from perception.visits.scene import update_settings
 from perception.visits.update import update_map
@@ -65,7 +72,7 @@ def test_states_are_the_true_ones(world: Path, new: Map) -> None:
     true = {e["id"]: e for e in json.loads((world / "visit1" / "changes.json").read_text())["instances"]}
     said: dict[str, list[str]] = {"removed": [], "unchanged": []}
     for change in changes_of(new.info, new.instances, 0):
-        if change["state"] == "added":
+        if change["instance_id"] not in old.instance_ids:  # added, or known by its looks alone
             continue
         entry = true[thing_of(old, change["instance_id"], world / "visit0")]
         if not entry["is_stuff"]:
@@ -125,3 +132,63 @@ def test_the_truth_of_a_visit_agrees_with_its_pictures(world: Path) -> None:
             assert entry["id"] not in seen
         elif entry["seen_in_visit2"] > 0.05:
             assert entry["id"] in seen
+
+
+def command(world: Path, visit: Path, name: str) -> list[str]:
+    """The words of `perception update` for a visit of the world."""
+    masks = ["--masks", f"labels:{world / 'visit1' / 'labels'}"]
+    return ["update", str(world / "old.gsmap"), str(visit), "-o", str(world / name), *masks]
+
+
+def test_a_killed_update_goes_on_to_the_same_map(world: Path, new: Map) -> None:
+    words, out = command(world, world / "visit1", "killed.gsmap"), world / "killed.gsmap"
+    often = "import sys, perception.cli, perception.pipeline.checkpoint as m; m.CHECKPOINT_SECONDS = .01; "
+    run = [sys.executable, "-c", f"{often}sys.exit(perception.cli.main(sys.argv[1:]))", *words]
+    process = subprocess.Popen(run, stderr=subprocess.DEVNULL, cwd=world)
+    checkpoint = work_folder(out) / "leg-settle" / "checkpoint.pt"
+    while process.poll() is None and not checkpoint.exists():
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert checkpoint.exists() and not out.exists()
+    assert main(words) == 2  # the unfinished run is named, not overwritten
+    assert main([*words, "--resume"]) == 0
+    one, other = content(world / "new.gsmap"), content(out)
+    assert one.keys() == other.keys() and not work_folder(out).exists()
+    assert all(one[name] == other[name] for name in one if name != "map.json")
+
+
+def test_photos_alone_are_localised(world: Path) -> None:
+    photos = world / "photos"
+    shutil.copytree(world / "visit1" / "images", photos)
+    assert main(command(world, photos, "localised.gsmap")) == 0
+    old, gmap = read_map(world / "old.gsmap"), read_map(world / "localised.gsmap")
+    poses = {Path(view.name).name: view.camera_from_world for view in gmap.views if view.visit == 1}
+    given = {Path(v.name).name: v.camera_from_world for v in read_map(world / "new.gsmap").views if v.visit == 1}
+    assert poses.keys() == given.keys()
+    size = np.ptp(old.means, axis=0).max()
+    shifts = [np.linalg.norm(np.linalg.inv(poses[n])[:3, 3] - np.linalg.inv(given[n])[:3, 3]) for n in poses]
+    assert np.median(shifts) < 0.01 * size
+
+
+def test_bad_visits_are_refused_in_one_line(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before, second = content(world / "old.gsmap"), world / "visit1"
+    empty, unit, nothing = tmp_path / "empty", tmp_path / "unit", tmp_path / "nothing"
+    empty.mkdir()
+    (empty / "notes.txt").write_text("no photo")
+    nothing.mkdir()
+    (nothing / "transforms.json").write_text(json.dumps({"w": 1, "h": 1, "fl_x": 1, "fl_y": 1, "frames": []}))
+    shutil.copytree(second, unit)
+    placed = json.loads((second / "transforms.json").read_text())
+    for frame in placed["frames"]:
+        matrix = np.array(frame["transform_matrix"])
+        matrix[:3, 3] *= 10
+        frame["transform_matrix"] = matrix.tolist()
+    (unit / "transforms.json").write_text(json.dumps(placed))
+    for source, what in ((empty, "no"), (nothing, "no"), (unit / "transforms.json", "unit"), (tmp_path / "x", "no")):
+        assert main(command(world, source, "no.gsmap")) == 2
+        err = capsys.readouterr().err.strip().splitlines()
+        assert what in err[-1] and str(source) in err[-1], err
+        assert not (world / "no.gsmap").exists()
+        shutil.rmtree(work_folder(world / "no.gsmap"), ignore_errors=True)
+    assert content(world / "old.gsmap") == before

@@ -1,6 +1,6 @@
 """Scores what `perception update` says of a second visit with exact truth, beside two maps made apart.
 
-python tools score.visits VISIT1 VISIT2 WORK [--masks labels|labels_sam|builtin] [--set KEY=VALUE ...]
+python tools score.visits VISIT1 VISIT2 WORK [--masks labels|labels_sam|builtin] [--alone] [--set KEY=VALUE ...]
 
 VISIT1 and VISIT2 are truth folders, as `worlds.visits` writes them; VISIT2 holds changes.json. The maps of both are
 made in WORK, and kept. Two tables: `update` of the first map; and the naive way, in which instances of the two maps are
@@ -21,7 +21,7 @@ import numpy as np
 
 from perception.config import MapConfig, load_config
 from perception.io.cloud import read_cloud
-from perception.map.history import changes_of
+from perception.map.history import changes_of, visits_of
 from perception.map.write import Map, read_map
 from perception.pipeline.mapping import build_map
 from perception.progress import Progress
@@ -63,26 +63,29 @@ class Truth:
         return state, {state, "unseen"} if seen < PARTLY and state != "added" else {state}
 
 
-def owners(gmap: Map, points: np.ndarray, true: np.ndarray) -> dict[int, int]:
-    """By thing: the instance of the map with an IoU > .5 on the true points."""
+def owners(gmap: Map, points: np.ndarray, true: np.ndarray) -> tuple[dict[int, int], dict[int, int]]:
+    """By thing: the instance of the map with an IoU > .5 on the true points. By instance: the thing that most of its
+    points are of."""
     from scipy.spatial import cKDTree
 
     held = gmap.instance_ids >= 0
     distance, nearest = cKDTree(gmap.means[held]).query(points)
     label = np.where(distance < 4 * np.median(distance), gmap.instance_ids[held][nearest], -1)
-    found = {}
+    found, most = {}, {}
     for instance in np.unique(label[label >= 0]).tolist():
         mine = label == instance
         things, counts = np.unique(true[mine], return_counts=True)
         thing, both = int(things[counts.argmax()]), int(counts.max())
+        most[instance] = thing
         if both > 0.5 * (mine.sum() + (true == thing).sum() - both):
             found[thing] = instance
-    return found
+    return found, most
 
 
 def scores(changes: list[dict[str, Any]], first: Map, second: Map, truth: Truth) -> dict[str, Any]:
     """Precision, recall and F1 of each state; false alarms, unseen things called removed, errors of motions, ids."""
-    before, after = owners(first, truth.points[0], truth.ids[0]), owners(second, truth.points[1], truth.ids[1])
+    before, most_before = owners(first, truth.points[0], truth.ids[0])
+    after, most_after = owners(second, truth.points[1], truth.ids[1])
     said = {change["instance_id"]: change for change in changes if change["state"] != "added"}
     added = {change["instance_id"] for change in changes if change["state"] == "added"}
     right, wrong, true = (dict.fromkeys(STATES, 0) for _ in range(3))
@@ -115,6 +118,12 @@ def scores(changes: list[dict[str, Any]], first: Map, second: Map, truth: Truth)
             errors.append(
                 _error(np.array(told["transform"]), np.array(truth.entries[thing]["transform"]), thing, truth)
             )
+    for change in changes:  # of instances that are no thing: those on stuff do not count
+        new, instance = change["state"] == "added", change["instance_id"]
+        if instance not in (after if new else before).values():
+            most = (most_after if new else most_before).get(instance)
+            stuff = most is not None and most not in truth.entries
+            wrong[change["state"]] += not stuff and (most is None or change["state"] not in truth.right(most)[1])
     table = {
         state: {
             "precision": right[state] / max(1, right[state] + wrong[state]),
@@ -177,6 +186,7 @@ def main() -> None:
     for name in ("first", "second", "work"):
         parser.add_argument(name, type=Path)
     parser.add_argument("--masks", choices=("labels", "labels_sam", "builtin"), default="labels")
+    parser.add_argument("--alone", action="store_true", help="the photos of VISIT2 without their poses")
     parser.add_argument("--set", action="append", default=[], dest="pairs")
     given = parser.parse_args()
     given.work.mkdir(parents=True, exist_ok=True)
@@ -196,14 +206,15 @@ def main() -> None:
         mapped(folder, given.work / f"{name}.gsmap")
         for folder, name in ((given.first, "first"), (given.second, "apart"))
     )
-    output, start = given.work / "today.gsmap", time.monotonic()
+    source = given.second / "images" if given.alone else given.second
+    output, start = given.work / ("alone.gsmap" if given.alone else "today.gsmap"), time.monotonic()
     if not output.exists():
         config = update_settings(given.work / "first.gsmap", None, [masks(given.second)])
-        update_map(given.work / "first.gsmap", given.second, output, config, progress=Progress())
+        update_map(given.work / "first.gsmap", source, output, config, progress=Progress())
     today = read_map(output)
     seconds["today"] = round(time.monotonic() - start, 1)
     truth = Truth.read(given.first, given.second)
-    show("update", scores(changes_of(today.info, today.instances, 0), first, today, truth))
+    show("update", scores(changes_of(visits_of(today.info, len(today.views)), today.instances, 0), first, today, truth))
     show("two maps made apart", scores(naive(first, apart), first, apart, truth))
     figures = [(name, gmap.info["quality"].get("psnr")) for name, gmap in (("update", today), ("new map", apart))]
     print("held-out PSNR: " + ", ".join(f"{name} {psnr:.2f} dB" for name, psnr in figures if psnr is not None))
