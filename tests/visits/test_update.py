@@ -19,7 +19,7 @@ from perception.cli import main
 from perception.config import load_config
 from perception.errors import InputError
 from perception.io.cloud import read_cloud
-from perception.map.history import changes_of
+from perception.map.history import changes_of, visits_of
 from perception.map.write import Map, read_map
 from perception.pipeline.checkpoint import work_folder
 from perception.pipeline.mapping import build_map
@@ -71,7 +71,7 @@ def test_states_are_the_true_ones(world: Path, new: Map) -> None:
     old = read_map(world / "old.gsmap")
     true = {e["id"]: e for e in json.loads((world / "visit1" / "changes.json").read_text())["instances"]}
     said: dict[str, list[str]] = {"removed": [], "unchanged": []}
-    for change in changes_of(new.info, new.instances, 0):
+    for change in changes_of(visits_of(new.info), new.instances, 0):
         if change["instance_id"] not in old.instance_ids:  # added, or known by its looks alone
             continue
         entry = true[thing_of(old, change["instance_id"], world / "visit0")]
@@ -79,7 +79,7 @@ def test_states_are_the_true_ones(world: Path, new: Map) -> None:
             said.setdefault(entry["state"], []).append(change["state"])
     assert said["removed"] and set(said["removed"]) <= {"removed", "moved"}
     assert said["unchanged"].count("unchanged") == len(said["unchanged"]) > 5
-    added = [c["instance_id"] for c in changes_of(new.info, new.instances, 0) if c["state"] == "added"]
+    added = [c["instance_id"] for c in changes_of(visits_of(new.info), new.instances, 0) if c["state"] == "added"]
     assert added and {true[thing_of(new, i, world / "visit1")]["state"] for i in added} <= {"added"}
 
 
