@@ -88,7 +88,7 @@ class Escalation:
     known: list[Any] = field(default_factory=list)
     support: int = 0
     trusted: bool = False
-    """Whether the matches of `more` contradict no photo of the models at once."""
+    """Whether half of the photos are in the models at once, and the matches of `more` contradict none of these."""
 
     def run(self) -> tuple[Candidate, list[dict[str, Any]]]:
         """The best candidate; of each step its name, the photos registered after it, and seconds."""
@@ -146,7 +146,8 @@ class Escalation:
             return None
         start = self._adjusted(self.best.models[:1], store)
         self.support = Candidate([start], set(), store).support
-        self.trusted = consistent_photos(verified_pairs(start, store.database)) == self.best.registered
+        many = 2 * len(self.best.registered) >= len(store.names)
+        self.trusted = many and consistent_photos(verified_pairs(start, store.database)) == self.best.registered
         grown = [self._grown(start, store)]
         grown += [self._grown(self._adjusted([model], store), store) for model in self.best.models[1:]]
         return max(grown, key=lambda each: len(each.registered))
