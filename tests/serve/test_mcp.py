@@ -86,7 +86,8 @@ def photo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def stdio(path: Path, *options: str) -> StdioServerParameters:
     import os
 
-    return StdioServerParameters(command=sys.executable, args=["-c", STDIO, str(path), *options], env=dict(os.environ))
+    command = ["-c", STDIO, str(path), *options]
+    return StdioServerParameters(command=sys.executable, args=command, env=dict(os.environ), cwd=path.parent)
 
 
 def ended(client: Client, work: Callable[[Client], Awaitable[Any]]) -> Any:
@@ -198,6 +199,7 @@ def test_every_tool_over_stdio_and_a_map_replaced_under_it(tmp_path: Path, photo
 def spoken(path: Path) -> subprocess.Popen[bytes]:
     process = subprocess.Popen(
         [sys.executable, "-c", STDIO, str(path)],
+        cwd=path.parent,  # in a checkout, Python would import the sources
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
