@@ -11,6 +11,7 @@ import pytest
 from worlds.packages import ABSENT, make_packages
 
 
+@pytest.mark.slow
 def test_twenty_prompts_with_exact_truth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("worlds.packages.room_around", lambda *_: [])  # painting it takes longest
     make_packages(tmp_path, seed=1, views=3, width=64, height=48, rays=1)

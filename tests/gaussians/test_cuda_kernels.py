@@ -68,6 +68,7 @@ def test_the_order_of_the_lanes_changes_no_bit(lanes):
         assert torch.equal(a, b)
 
 
+@pytest.mark.slow
 def test_the_float_build_follows_the_double_build():
     inputs = wide_scene(dtype=torch.float32)
     exact = grads_and_images(cast(inputs, torch.float64))
@@ -77,6 +78,7 @@ def test_the_float_build_follows_the_double_build():
         assert error <= 3 * cpu_error + 1e-5  # flips at the 1/255 threshold are in both
 
 
+@pytest.mark.slow
 def test_memory_is_bounded_by_strips(monkeypatch):
     monkeypatch.setattr(on_device, "device_kernels", emulated())
     inputs = wide_scene()
@@ -142,6 +144,7 @@ def test_the_cpu_rasterizer_is_in_place_again():
     assert cpu.rasterize_backward is not on_device.rasterize_backward
 
 
+@pytest.mark.slow
 def test_fifty_steps_of_training_end_where_the_cpu_ends():
     target = perception.rasterize(**scene(n=40, dims=5, cameras=1, seed=2)).colors
 

@@ -139,6 +139,7 @@ def pretended(monkeypatch):
         yield device
 
 
+@pytest.mark.slow
 def test_the_pretended_device_refuses_what_a_gpu_refuses(pretended):
     there = torch.ones(3, device=pretended)
     assert there.device == pretended and float((there + 1).sum()) == 6 and torch.equal(there.cpu(), torch.ones(3))
@@ -148,6 +149,7 @@ def test_the_pretended_device_refuses_what_a_gpu_refuses(pretended):
         there.numpy()
 
 
+@pytest.mark.slow
 def test_the_first_steps_are_those_of_the_cpu(pretended):
     """Until rounding matters: Adam turns gradients of rounding size into whole steps."""
     here, there = trainer(None, "train.iterations=1000"), trainer(pretended, "train.iterations=1000")
@@ -185,6 +187,7 @@ def test_a_whole_training_runs_there_and_resumes_with_the_same_bits(pretended):
     assert surface_depth(whole.gaussians, whole.views[0]).shape == (32, 40)
 
 
+@pytest.mark.slow
 def test_labels_and_votes_of_a_photo_are_those_of_the_cpu(pretended, monkeypatch):
     monkeypatch.setattr(on_device, "_AT_ONCE", 2)  # several times
     of, view = trainer(None), painted_wall(0.0)

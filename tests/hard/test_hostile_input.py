@@ -440,6 +440,7 @@ def test_faces_whose_corners_are_no_list(tmp_path: Path) -> None:
 # ------------------------------------------------------------------ label images
 
 
+@pytest.mark.slow
 def test_damaged_label_images_of_an_earlier_run(tmp_path: Path) -> None:
     view = View("a.jpg", Path("a.jpg"), np.eye(3), 8, 6, np.eye(4))
     file = tmp_path / "a.jpg.png"

@@ -214,6 +214,7 @@ def test_one_camera_that_is_not_finite_is_left_out(what: str, value: str, tmp_pa
         loaded(folder, strict=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["camera", "pose"])
 def test_the_same_in_a_binary_model(what: str, tmp_path: Path) -> None:
     pycolmap = load_pycolmap()

@@ -112,6 +112,7 @@ def clip_folder(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
     return folder, model
 
 
+@pytest.mark.slow
 def test_clip_pair_matches_transformers(clip_folder: tuple[Path, Any]) -> None:
     folder, model = clip_folder
     encoder = make_encoder(f"clip:{folder}")

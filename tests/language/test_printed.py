@@ -125,7 +125,7 @@ def _quality_by_rule(word: str, other: str) -> float:
     return max(near * (near >= 0.75), inside * (inside >= 0.6), 0.75 * ends)
 
 
-@pytest.mark.parametrize("size", [3, 6, 60, 900])
+@pytest.mark.parametrize("size", [3, 6, 60, pytest.param(900, marks=pytest.mark.slow)])
 def test_what_is_printed_in_a_large_map_costs_no_line_of_python_for_each_character(size: int) -> None:
     rng = np.random.default_rng(size)
 

@@ -55,6 +55,7 @@ def test_poses_as_json_and_as_a_file_in_the_maps_frame(folder: Path, capsys: pyt
         assert np.allclose(photo["position"], np.linalg.inv(truth)[:3, 3], atol=0.003)
 
 
+@pytest.mark.slow
 def test_a_photo_of_the_map_itself_from_python(folder: Path) -> None:
     gmap = perception.load_map(folder / "a.gsmap")
     picture = cv2.imread(str(folder / "new/0.png"))[..., ::-1]
@@ -67,6 +68,7 @@ def test_a_photo_of_the_map_itself_from_python(folder: Path) -> None:
         gmap.localise(folder / "nothing.png")
 
 
+@pytest.mark.slow
 def test_a_map_whose_photos_are_gone_is_rendered_and_their_new_folder_is_taken(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -85,6 +87,7 @@ def test_a_map_whose_photos_are_gone_is_rendered_and_their_new_folder_is_taken(
     assert "0.png: not in this map" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_what_cannot_be_used_is_told_in_one_line(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -52,6 +52,7 @@ def test_new_photos_get_their_exact_poses_and_honest_errors(
     assert all(np.array_equal(a.camera_from_map, b.camera_from_map) for a, b in zip(found, again, strict=True))  # type: ignore[union-attr]
 
 
+@pytest.mark.slow
 def test_photos_of_another_room_are_named_and_the_others_localised(
     room: PaintedRoom, known: Localiser, tmp_path: Path
 ) -> None:
@@ -96,6 +97,7 @@ def test_equal_walls_leave_a_photo_of_one_of_them_in_doubt(tmp_path: Path) -> No
             assert "two poses fit" in answer.why
 
 
+@pytest.mark.slow
 def test_a_lens_is_given_or_the_maps_or_estimated(room: PaintedRoom, known: Localiser, tmp_path: Path) -> None:
     """A photo of another shape, of a camera with 0.8 times the focal length, of which nothing is known."""
     size, focal = (420, 280), 0.8 * FOCAL
@@ -112,6 +114,7 @@ def test_a_lens_is_given_or_the_maps_or_estimated(room: PaintedRoom, known: Loca
     assert difference(given.camera_from_map, truth)[0] < NEAR[0]
 
 
+@pytest.mark.slow
 def test_measured_depth_makes_a_pose_surer_in_any_unit(room: PaintedRoom, known: Localiser, tmp_path: Path) -> None:
     truth = walk(1, 4, 0.15)[1]
     photo = new(room, tmp_path, [truth])[0]
@@ -133,6 +136,7 @@ def test_a_map_without_matches_knows_no_photo(tmp_path: Path) -> None:
     assert isinstance(answer, NotHere)
 
 
+@pytest.mark.slow
 def test_photos_of_all_kinds_are_read(room: PaintedRoom, known: Localiser, tmp_path: Path) -> None:
     """Another format, grey, turned by EXIF, with EXIF's focal length; black ones are no error."""
     truth = walk(1, 4, 0.15)[1]

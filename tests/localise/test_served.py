@@ -54,6 +54,7 @@ def text_of(photo: Path) -> str:
     return base64.b64encode(photo.read_bytes()).decode()
 
 
+@pytest.mark.slow
 def test_over_http(engine: QueryEngine, folder: Path) -> None:
     pytest.importorskip("fastapi", reason="the extra 'serve' is not installed")
     from starlette.testclient import TestClient
@@ -87,12 +88,14 @@ def test_over_http(engine: QueryEngine, folder: Path) -> None:
     assert client.post("/query", json={"text": "a" * 2 * MAX_BYTES}).status_code == 413
 
 
+@pytest.mark.slow
 def test_a_picture_of_too_many_pixels_is_refused_by_its_header(engine: QueryEngine, folder: Path) -> None:
     huge = cv2.imencode(".png", np.zeros((8000, 8000), np.uint8))[1].tobytes()
     with pytest.raises(InputError, match="pixels"):
         served.localised(engine.current, huge, None, folder / "photos")
 
 
+@pytest.mark.slow
 def test_the_first_question_is_told_to_come_again(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     go = threading.Event()
     monkeypatch.setattr(served, "WAIT", 0.01)
@@ -106,6 +109,7 @@ def test_the_first_question_is_told_to_come_again(folder: Path, monkeypatch: pyt
     served._made.cache_clear()
 
 
+@pytest.mark.slow
 def test_as_a_tool_with_a_picture_or_a_file_of_an_allowed_folder(engine: QueryEngine, folder: Path) -> None:
     pytest.importorskip("mcp", reason="the extra 'mcp' is not installed")
     from perception.serve.mcp import TOOLS
@@ -151,6 +155,7 @@ def image_of(photo: Path) -> SimpleNamespace:
     return SimpleNamespace(header=head, encoding="bgr8", data=picture.tobytes(), **facts)
 
 
+@pytest.mark.slow
 def test_on_ros(engine: QueryEngine, folder: Path) -> None:
     served._made(engine.current, folder / "photos").result(300)
     heard = Heard()
@@ -175,6 +180,7 @@ def test_on_ros(engine: QueryEngine, folder: Path) -> None:
     assert heard.answer()["error"]["kind"] == "bad_input"
 
 
+@pytest.mark.slow
 def test_images_that_come_meanwhile_are_dropped(engine: QueryEngine, folder: Path) -> None:
     heard, go = Heard(), threading.Event()
     node = Localising(engine, heard, NodeConfig(photos=str(folder / "photos")))

@@ -92,6 +92,7 @@ def sam2() -> Any:
     return transformers.Sam2Model(config)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [sam, sam2])
 def test_masks_and_scores_are_those_of_transformers(make: Any, tmp_path: Path) -> None:
     torch.manual_seed(0)

@@ -122,6 +122,7 @@ def test_labels_engine_and_http_answer_alike(world: dict[str, Any]) -> None:
     assert np.array_equal(world["points"], members(world, 0))
 
 
+@pytest.mark.slow
 def test_shell_lines_do_what_they_say(kitchen: Path, tmp_path: Path) -> None:
     lines = [line for kind, code in SNIPPETS if kind == "sh" for line in code.strip().splitlines()]
     commands = [shlex.split(line)[1:] for line in lines if line.startswith("perception ")]

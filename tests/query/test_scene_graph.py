@@ -119,6 +119,7 @@ def test_next_to_is_mutual_and_on_the_same_support() -> None:
     assert not beside & {("mug", "crate"), ("apple", "lamp"), ("table", "lamp"), ("bin", "book")}
 
 
+@pytest.mark.slow
 def test_rooms_are_parted_by_a_door() -> None:
     """Two rooms of 3 × 3 m and the wall between them, with a door of 0.9 m."""
     walls = [box((x, 0, 0), (x + 0.1, 3, 2.4)) for x in (0.0, 6.3)]

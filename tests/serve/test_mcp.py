@@ -221,6 +221,7 @@ def send(process: subprocess.Popen[bytes], message: dict[str, Any]) -> None:
 CALL = {"method": "tools/call", "params": {"name": "list_objects", "arguments": {}}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["closes", "vanishes", "interrupts"])
 def test_the_process_ends_with_its_client(tmp_path: Path, how: str) -> None:
     """A client that ends the session, one that is gone while calls run, and Ctrl-C while nothing is asked."""
@@ -247,6 +248,7 @@ def test_the_process_ends_with_its_client(tmp_path: Path, how: str) -> None:
             process.communicate()
 
 
+@pytest.mark.slow
 def test_what_is_no_message_is_survived(tmp_path: Path) -> None:
     process = spoken(write_map_of(tmp_path / "a.gsmap", gaussians=300))
     assert process.stdin is not None and process.stdout is not None
@@ -278,6 +280,7 @@ def at(port: int) -> str:
     return f"http://127.0.0.1:{port}/mcp"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["auto", "legacy"])
 def test_every_tool_over_http(port: int, mode: str) -> None:
     asked = {"text": "lamp"}, {}, {"id": RED}, {"point": [0, 0, 0]}, {"a": 1, "b": 2}
@@ -290,6 +293,7 @@ def test_every_tool_over_http(port: int, mode: str) -> None:
     ended(Client(at(port), mode=mode), session)
 
 
+@pytest.mark.slow
 def test_without_its_photos_a_map_is_rendered(port: int) -> None:
     async def session(client: Client) -> Any:
         return await client.call_tool("describe", {"id": RED})
@@ -299,6 +303,7 @@ def test_without_its_photos_a_map_is_rendered(port: int) -> None:
     assert middle(shown(result)) @ [2, -1, -1] > 300  # red
 
 
+@pytest.mark.slow
 def test_errors_say_what_to_do(port: int) -> None:
     def frame(scale: float) -> dict[str, Any]:
         return {"name": "base", "from_map": np.diag([scale, scale, scale, 1]).tolist()}
@@ -332,6 +337,7 @@ def test_errors_say_what_to_do(port: int) -> None:
     ended(Client(at(port)), session)
 
 
+@pytest.mark.slow
 def test_clients_that_vanish_leave_the_server_answering(port: int) -> None:
     body = json.dumps({"jsonrpc": "2.0", "id": 1, **CALL}).encode()
     head = "POST /mcp HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\nContent-Length: {}\r\n"
@@ -349,6 +355,7 @@ def test_clients_that_vanish_leave_the_server_answering(port: int) -> None:
     assert time.monotonic() - began < 30
 
 
+@pytest.mark.slow
 def test_the_rules_for_host_token_and_size_are_those_of_serve(port: int, tmp_path: Path) -> None:
     with httpx2.Client(timeout=60) as web:
         send = {"content": b"{}", "headers": {"Content-Type": "application/json"}}
@@ -396,6 +403,7 @@ def test_where_to_stand_is_before_the_middle_of_a_long_side(tmp_path: Path) -> N
         ended(Client(make_server(engine, None)), session)
 
 
+@pytest.mark.slow
 def test_a_photo_outside_of_the_map_is_sent_only_where_the_user_allows_it(
     tmp_path: Path, photo: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

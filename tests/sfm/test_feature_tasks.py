@@ -42,6 +42,7 @@ def rows(database: Path) -> dict[str, list[tuple[Any, ...]]]:
         return {name: sorted(tables.execute(f"SELECT * FROM {name}")) for name in TABLES}
 
 
+@pytest.mark.slow
 def test_the_database_is_that_of_one_process(
     photos: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -61,6 +62,7 @@ def test_the_database_is_that_of_one_process(
     assert [path.name for path in (tmp_path / "there").iterdir()] == [there.folder.name]  # no task is left
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_makes_no_task_twice(
     photos: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

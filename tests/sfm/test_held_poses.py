@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from perception.sfm.bundle_adjustment import Poses, adjust
@@ -49,6 +50,7 @@ def test_held_cameras_stay_and_the_other_gets_its_exact_pose() -> None:
     assert np.abs(found.rotation[-1] - poses.rotation[-1]).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_covariances_are_those_of_repeated_noise() -> None:
     poses, _, tracks = made()
     rng, changes, covariances = np.random.default_rng(0), [], []

@@ -53,6 +53,7 @@ def test_networks_learn_a_rule_that_is_not_linear():
     assert ((network(x[5000:]) > 0) == y[5000:]).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_things_of_a_group_in_patchwork_touch_and_do_not_share_space():
     """Boxes of one orientation along the row: their extents may meet, not overlap."""
     for seed in range(20):
