@@ -22,7 +22,7 @@ from perception.sfm import merge
 from perception.sfm.consistency import consistent_photos, fold_warnings, verified_pairs
 from perception.sfm.database import FeatureStore, verified_matches
 from perception.sfm.feature_tasks import write_part
-from perception.sfm.features import THOROUGH, Group, extract, match
+from perception.sfm.features import FEW_FEATURES, THOROUGH, Group, extract, match
 from perception.sfm.incremental import (
     MIN_MODEL_SIZE,
     REPEATABLE_PHOTOS,
@@ -99,7 +99,7 @@ class Escalation:
         tries |= {"global mapping": self._global} if few else {}
         for name, attempt in tries.items():
             registered, started = len(self.best.registered), time.perf_counter()
-            if registered == len(names) or (self.more is not None and not self._linked(self.more)):
+            if registered == len(names) or not (self._linked(self.more) if self.more else self._left_out()):
                 break
             self.options.progress.log(f"poses: {registered} of {len(names)} photos registered; {name} is next")
             self.more = self.more or self._more_features()
@@ -130,6 +130,14 @@ class Escalation:
         across = [pair.agrees for pair in pairs if len({pair.i, pair.j} & self.best.registered) == 1]
         return across.count(False) * DOUBT > len(across)
 
+    def _left_out(self) -> list[int]:
+        """Rows of the photos that are not registered and have enough features to be."""
+        store, done = self.best.store, set() if self.best.folded else self.best.registered
+        with load_pycolmap().Database.open(store.database) as db:
+            ids = [db.read_image_with_name(name).image_id for name in store.names]
+            enough = [db.num_keypoints_for_image(image) >= FEW_FEATURES for image in ids]
+        return [row for row, image in enumerate(ids) if enough[row] and image not in done]
+
     def _linked(self, store: FeatureStore) -> dict[tuple[int, int], int]:
         """Verified matches of the pairs of photos, by image ids, that are not in one model."""
         done = [set(model.reg_image_ids()) for model in self.best.models]
@@ -155,8 +163,9 @@ class Escalation:
     def _anew(self, store: FeatureStore) -> Candidate | None:
         found = []
         for models, out in candidates(store, self.fixed, self.options.seed, self.options.progress, most=CANDIDATES):
+            complete = models[0].num_reg_images()
             found.append(self._checked(models, out, store))
-            if found[-1].registered == set(models[0].reg_image_ids()) and not found[-1].folded:
+            if len(found[-1].registered) >= complete and not found[-1].folded:
                 break
         return max(found, key=lambda each: (not each.folded, each.support), default=None)
 
@@ -242,8 +251,7 @@ class Escalation:
         if not folder.is_dir():
             with load_pycolmap().Database.open(store.database) as db:
                 ids = [db.read_image_with_name(name).image_id for name in names]
-            done = set() if self.best.folded else self.best.registered
-            left = [row for row, image in enumerate(ids) if image not in done]
+            left = self._left_out()
             similar = similar_photos(largest_features(store.database, names))
             again = np.asarray(similar[left].any(axis=0))
             again[left] = True

@@ -18,6 +18,8 @@ MAX_IMAGE_SIDE = 1600
 """Larger photos are downscaled for feature extraction only; keypoints are in full-resolution pixels."""
 MIN_FEATURES = 450
 """Photos with fewer than MIN_FEATURES are extracted again at double size (first octave −1), at four times the cost."""
+FEW_FEATURES = 50
+"""Photos with fewer, at double size, are blank, dark or blurred: no more effort registers them."""
 PEAK_THRESHOLD = 0.004
 PAIRS_AT_ONCE = 2000
 """Pairs between two steps of the progress bar."""

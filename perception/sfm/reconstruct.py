@@ -25,7 +25,7 @@ from perception.photos.still import with_still
 from perception.sfm.consistency import model_warnings
 from perception.sfm.database import FeatureStore, build_features, verified_matches
 from perception.sfm.escalation import MORE, Candidate, Escalation
-from perception.sfm.features import camera_groups
+from perception.sfm.features import FEW_FEATURES, camera_groups
 from perception.sfm.incremental import REPEATABLE_PHOTOS, map_photos, read_models, write_models
 from perception.sfm.model import cloud_of, views_of_model
 from perception.sfm.options import ReadOptions
@@ -119,7 +119,7 @@ def _at_once(store: FeatureStore, fixed: bool, options: ReadOptions) -> Candidat
 
 def _brought(steps: list[dict[str, Any]], count: int) -> list[str]:
     """A note on the steps for photos that are not registered at once, if there were any."""
-    if not steps:
+    if len(steps) < 2:
         return []
     gains = [(step["step"], step["registered"] - before["registered"]) for before, step in pairwise(steps)]
     told = ", ".join(f"{name} added {gain or 'none'}" for name, gain in gains)
@@ -166,7 +166,7 @@ def _reason(name: str, contradicted: set[str], others: list[set[str]], matches: 
         return "most of its verified matches contradict every pose found for it (equal textures?)"
     if any(name in other for other in others):
         return "registered in another, smaller model that does not connect to the largest"
-    if features < 100:
+    if features < FEW_FEATURES:
         return f"too few features ({features}): blurred, dark or without texture"
     if best < 30:
         return f"too few verified matches (best partner: {best}): too little overlap with the other photos"

@@ -143,6 +143,19 @@ def test_photos_without_matches_cost_one_step(tmp_path: Path, monkeypatch: pytes
     assert best is first
 
 
+@pytest.mark.parametrize("blank", [PHOTOS, PHOTOS - 1])
+def test_photos_without_features_cost_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, blank: int) -> None:
+    room, asked = Room(), []
+    for number in range(blank):
+        room.seen[number] = tuple(each[: features.FEW_FEATURES - 1] for each in room.seen[number])
+    store = room.store(tmp_path / "early", QUICK, lambda i, j: False)
+    more = room.store(tmp_path / "early" / MORE, THOROUGH, lambda i, j: False)
+    monkeypatch.setattr(Escalation, "_more_features", lambda self: asked.append(self._left_out()) or more)
+    _, steps = Escalation(Candidate([], set(), store), [], False, ReadOptions(tmp_path, progress=Told())).run()
+    assert asked == [list(range(blank, PHOTOS))] * (blank < PHOTOS)
+    assert [step["step"] for step in steps] == ["at once", "more features"][: 1 + len(asked)]
+
+
 @pytest.mark.slow
 def test_a_scene_is_mapped_anew_where_nothing_is_registered_at_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
