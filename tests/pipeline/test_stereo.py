@@ -16,7 +16,7 @@ from support.two_walls import HEIGHT, WIDTH, taken, write_scene
 pytestmark = pytest.mark.slow
 
 EYES = [(x, z) for x in (-0.5, 0.0, 0.5) for z in (-0.25, 0.25)]
-SETTINGS = ["train.iterations=150", "train.budget=6000", "photos.holdout=0", "language.encoder=none"]
+SETTINGS = ["train.iterations=80", "train.budget=5000", "photos.holdout=0", "language.encoder=none"]
 
 
 def depth_errors(scene: Path, out: Path, *more: str) -> tuple[np.ndarray, list[str]]:
