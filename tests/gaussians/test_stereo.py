@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import map_coordinates
 
 from perception.config import load_config
 from perception.gaussians.depth_start import start_on_surface
@@ -18,45 +17,7 @@ from perception.gaussians.train import STEREO_WEIGHT, Trainer
 from perception.gaussians.views import TrainingView, surface_depth
 from perception.pipeline.record import depth_used
 from perception.types import DepthImage, View
-from support.aimed import look_at
-
-WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
-K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-SLOPE, NEAR, HALF = 0.2, 2.6, 0.5
-"""The large wall is y = 4 + SLOPE x, the small one y = NEAR with |x|, |z| ≤ HALF."""
-
-
-def walls(eye: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Multiples of rays [..., 3] from `eye` at which they hit a wall, and whether it is the small one."""
-    far = (4 + SLOPE * eye[0] - eye[1]) / (rays[..., 1] - SLOPE * rays[..., 0])
-    near = (NEAR - eye[1]) / rays[..., 1]
-    at = eye + rays * near[..., None]
-    small = (np.abs(at[..., [0, 2]]) <= HALF).all(axis=-1)
-    return np.where(small, near, far), small
-
-
-def taken(x: float, z: float) -> tuple[View, TrainingView, np.ndarray]:
-    """A photo from (x, 0, z) of the walls, painted with noise, and its exact depth [HEIGHT, WIDTH]."""
-    eye = np.array([x, 0.0, z])
-    pose = look_at(eye, np.array([0, 3.0, 0]), np.array([0, 0, 1.0]))
-    row, column = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    rays = np.stack([(column - WIDTH / 2) / FOCAL, (row - HEIGHT / 2) / FOCAL, np.ones_like(row)], axis=-1)
-    depth, small = walls(eye, rays @ pose[:3, :3])
-    at = eye + rays @ pose[:3, :3] * depth[..., None]
-    paint = np.random.default_rng(1).uniform(0, 255, (2, 200, 200))
-    place = [small.astype(float), 100 + 22 * at[..., 0], 100 + 22 * at[..., 2]]
-    grey = map_coordinates(paint, place, order=1, mode="nearest").astype(np.uint8)
-    name = f"{x:.2f} {z:.2f}"
-    photo = torch.from_numpy(np.repeat(grey[..., None], 3, axis=2))
-    tensors = (torch.from_numpy(matrix.astype(np.float32)) for matrix in (K, pose))
-    return View(name, Path(name), K, WIDTH, HEIGHT, pose), TrainingView(name, photo, None, *tensors), depth
-
-
-def sparse(count: int) -> np.ndarray:
-    """[count, 3] random points on the walls, as seen from the origin."""
-    rng = np.random.default_rng(0)
-    rays = np.stack([rng.uniform(-0.4, 0.4, count), np.ones(count), rng.uniform(-0.3, 0.3, count)], axis=1)
-    return rays * walls(np.zeros(3), rays)[0][:, None]
+from support.two_walls import HALF, HEIGHT, NEAR, SLOPE, WIDTH, sparse, taken
 
 
 @pytest.fixture(scope="module")
