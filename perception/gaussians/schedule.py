@@ -22,6 +22,7 @@ from perception.gaussians.densify import START, STOP, decay_opacities, densify, 
 from perception.gaussians.early_stopping import TRIAL
 from perception.gaussians.losses import photometric
 from perception.gaussians.optimiser import Rate
+from perception.gaussians.starved import for_starved_masks
 from perception.gaussians.state import ITERATIONS, TrainingState
 from perception.gaussians.views import TrainingView, psnr, render_view, visible_in
 
@@ -108,6 +109,8 @@ def after_step(state: TrainingState, progress: float, may_stop: bool) -> None:
         _densify_and_judge(state, progress)
     if state.iteration % (5 * every) == 0 and state.progress < 1.0:
         _add_to_curve(state, progress)
+    if progress < STOP <= state.progress and state.has_labels:
+        _place_in_masks(state)
     if due and may_stop:
         _stop_early(state)
 
@@ -163,6 +166,21 @@ def _fill(state: TrainingState, seed: int) -> None:
         state.append(born)
         if len(born):
             _note(state, f"holes: {empty:.2%} of the images were empty, {len(born)} Gaussians added there")
+
+
+def _place_in_masks(state: TrainingState) -> None:
+    """Adds Gaussians for masks that have too few; above the budget, the faintest make room."""
+    with state.record.timed("densification"):
+        seed = int(np.random.default_rng([state.config.seed, state.iteration, 3]).integers(2**31))
+        born = for_starved_masks(state.gaussians, state.views, seed)
+        surplus = len(state.gaussians) + len(born) - max(state.config.train.budget, len(state.gaussians))
+        if len(born):
+            if surplus > 0:
+                order = torch.argsort(state.gaussians.opacity_logits[state.held :], stable=True)[surplus:] + state.held
+                state.keep(torch.cat([torch.arange(state.held).to(order), order.sort().values]))
+            state.append(born.to(state.device))
+            state.reset_statistics()
+            _note(state, f"masks: {len(born)} Gaussians added in masks that had too few")
 
 
 def _prune(state: TrainingState) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from statistics import NormalDist
 
 import numpy as np
 
@@ -16,10 +15,10 @@ from perception.language.shape_words import shape_kind
 from perception.map.map import Map, language_in
 from perception.query.hit import Hit
 from perception.query.instance_set import InstanceSet
-from perception.query.ranking import PRESENT, Ranker
+from perception.query.ranking import PRESENT, Ranker, evidence_of
 from perception.query.relations import parse
 
-CLEAR = 1.2  # least difference of Φ⁻¹(score) to every instance that shares points with the part or the group
+CLEAR = 1.2  # least difference of `evidence_of` to every instance that shares points with the part or the group
 
 
 @dataclass(frozen=True)
@@ -81,8 +80,8 @@ class Nodes:
         special = shape_kind(text) or parse(text) or quoted_text(text)
         if not self._nodes or special or hits[0][1] == 1.0:
             return list(hits)
-        score, normal, count = dict(self._ranker.rank(text).hits), NormalDist(), len(hits)
-        z = {n: normal.inv_cdf(min(max(s, 1e-9), 1 - 1e-9)) for n, s in score.items()}
+        score, count = dict(self._ranker.rank(text).hits), len(hits)
+        z = {n: float(evidence_of(np.array(s))) for n, s in score.items()}
         chosen, replaced = list[Candidate](), set[int]()
         for n, node in enumerate(self._nodes, start=count):
             if score[n] >= PRESENT and z[n] >= CLEAR + max(z[i] for i in node.rows):

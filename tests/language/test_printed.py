@@ -173,10 +173,10 @@ def test_a_quoted_text_must_be_there() -> None:
     rows, palette = np.eye(8, dtype=np.float32)[1:3], np.zeros((24, 4), np.float32)
     things = [InstanceDescription(row, row[None], palette, ["0.jpg"], [(0, 0, 9, 9)]) for row in rows]
     ranker = Ranker(things, Boxes(), printed=Printed([_on("SALT"), _on("PEPPER")]))
-    assert ranker.rank("the box").hits[0][1] > 0.999
+    assert ranker.rank("the box").hits[0][1] > 0.979  # 1 − LAPSE: nothing seen is certain
     salt, pepper, sugar = (ranker.rank(f"the box that says {word}") for word in ("SALT", "PEPPER", "SUGAR"))
     assert salt.present and salt.hits[0][0] == 0
-    assert not sugar.present and sugar.hits[0][0] == 0 and sugar.hits[0][1] == pytest.approx(0.5, abs=0.01)
+    assert not sugar.present and sugar.hits[0][0] == 0 and sugar.hits[0][1] == pytest.approx(0.49, abs=0.01)
     assert not pepper.present or pepper.hits[0][0] == 1
 
 

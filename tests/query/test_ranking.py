@@ -29,7 +29,7 @@ from perception.language.description import (
     unseen,
 )
 from perception.language.shape_words import KINDS
-from perception.query.ranking import PRESENT, Answer, Ranker, answering, probes
+from perception.query.ranking import LAPSE, PRESENT, Answer, Ranker, answering, probes
 
 DIM = 24
 
@@ -240,7 +240,16 @@ class Read(Table):
 
 def _z(scores: list[tuple[int, float]]) -> np.ndarray:
     """Scores back on the normal scale, in the order of the instances."""
-    return np.array([norm.ppf(s) for _, s in sorted(scores)])
+    return np.array([norm.ppf(s / (1 - LAPSE)) for _, s in sorted(scores)])
+
+
+def test_no_picture_makes_an_answer_certain(scene: tuple[Table, list[InstanceDescription]]) -> None:
+    encoder, things = scene
+    shapes = np.zeros((4, len(KINDS)))
+    shapes[:, KINDS.index("wall")] = 1.0
+    sure = Ranker(things, encoder, shapes=lambda: shapes).rank("wall").hits
+    assert 0.9 < sure[0][1] <= 1 - LAPSE
+    assert rank("stove", things, encoder, ["stove", None, None, None]).hits[0] == (0, 1.0)  # the user said so
 
 
 def test_a_margin_is_taken_off_every_answer(scene: tuple[Table, list[InstanceDescription]]) -> None:
@@ -253,11 +262,11 @@ def test_a_margin_is_taken_off_every_answer(scene: tuple[Table, list[InstanceDes
 
 def test_none_one_or_several_answer() -> None:
     """Scores by their quantiles: .7 behind the best is too far, .5 is not; below PRESENT nothing answers."""
-    hits = [(n, float(norm.cdf(x))) for n, x in enumerate((2.0, 1.5, 1.3, -1.0))]
+    hits = [(n, (1 - LAPSE) * float(norm.cdf(x))) for n, x in enumerate((2.0, 1.5, 1.3, -1.0))]
     assert answering(hits) == hits[:2] and answering(hits[1:]) == hits[1:3] and answering(hits[3:]) == []
     assert answering(hits, 0.0) == hits and answering(hits, 0.99) == [] and answering([]) == []
     assert answering([(1, PRESENT + 0.01), (0, PRESENT - 0.01)]) == [(1, PRESENT + 0.01)]
-    assert answering([(0, 1.0), (1, 1.0), (2, 0.99)]) == [(0, 1.0), (1, 1.0)]  # labels that equal the prompt
+    assert answering([(0, 1.0), (1, 1.0), (2, 0.97)]) == [(0, 1.0), (1, 1.0)]  # labels that equal the prompt
 
 
 def test_shapes_add_by_kind_and_only_where_named(scene: tuple[Table, list[InstanceDescription]]) -> None:

@@ -1,0 +1,133 @@
+"""Gaussians for masks that have too few of their own, such as that of a coin, whose Gaussians straddle its border.
+
+Such Gaussians belong to the coin in part and to the table in part, so no grouping can give the coin any. Once growth
+has ended, a mask of LEAST_PIXELS or more gets WANTED Gaussians on its surface if fewer than OWN lie within it, and if
+another photo shows their points inside one mask of about that size. Training then fits them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from perception.gaussians.model import Gaussians, isotropic
+from perception.gaussians.views import TrainingView, surface_depth, unprojected
+
+LEAST_PIXELS = 60  # of a mask; smaller ones are noise of the segmentation as often as things
+OWN, WANTED = 16, 24  # Gaussians: a segment of the grouping has 16
+SOLID = 0.1  # least opacity of a Gaussian that counts
+NEAR = 0.03  # relative difference of depths of one surface
+WITHIN = 0.5  # largest scale of a Gaussian of a mask, over the radius of a disc of the mask's area
+AGREE = 0.6  # share of the points that another photo must show in one mask
+ALIKE = 4.0  # factor within which the areas of both masks agree, seen from the same distance
+MOST = 0.05  # of all Gaussians are placed
+OPACITY = 0.5  # of those placed, as of those that fill holes
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A photo as the map shows it. labels [H, W] int64; depth [H, W], 0 = none; area [M] and own [M]: pixels and
+    Gaussians of each mask, 0 for label 0."""
+
+    view: TrainingView
+    labels: np.ndarray
+    depth: np.ndarray
+    area: np.ndarray
+    own: np.ndarray
+
+    @property
+    def camera(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.view.K.double().numpy(), self.view.camera_from_world.double().numpy()
+
+    def shown(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Label [P] and depth z [P] of each of points [P, 3]; label 0 where the photo does not show its surface."""
+        K, pose = self.camera
+        x, y, z = ((points[:, None] * pose[:3, :3]).sum(axis=2) + pose[:3, 3]).T
+        ahead = np.where(z > 1e-6, z, np.inf)
+        with np.errstate(invalid="ignore"):
+            column, row = K[0, 0] * x / ahead + K[0, 2], K[1, 1] * y / ahead + K[1, 2]
+        height, width = self.labels.shape
+        inside = (z > 1e-6) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        pixel = np.where(inside, row, 0).astype(int), np.where(inside, column, 0).astype(int)
+        inside &= np.abs(self.depth[pixel] - z) < NEAR * z
+        return np.where(inside, self.labels[pixel], 0), z
+
+
+@torch.no_grad()
+def for_starved_masks(gaussians: Gaussians, views: list[TrainingView], seed: int) -> Gaussians:
+    """The Gaussians to add; at most MOST of the N given."""
+    like = gaussians.to(torch.device("cpu"))
+    seen = [_seen(like, view) for view in views if view.labels is not None and bool((view.labels > 0).any())]
+    starved = [
+        (k, m) for k, one in enumerate(seen) for m in np.flatnonzero((one.area >= LEAST_PIXELS) & (one.own < OWN))
+    ]
+    starved.sort(key=lambda km: (-seen[km[0]].area[km[1]], km))
+    placed: list[tuple[int, np.ndarray]] = []  # of each mask, the photo and its pixels [P, 2], row and column
+    points, most = np.zeros((0, 3)), int(MOST * len(like))
+    for k, mask in starved:
+        if len(points) + WANTED > most:
+            break
+        pixels = _spread(seen[k].labels == mask, seen[k].depth)
+        served = seen[k].own[mask] + (seen[k].shown(points)[0] == mask).sum()
+        if served >= OWN or len(pixels) < OWN / 2:
+            continue
+        K, pose = seen[k].camera
+        new = unprojected(K, pose, pixels[:, 1] + 0.5, pixels[:, 0] + 0.5, seen[k].depth[tuple(pixels.T)])
+        if any(_confirms(other, new, seen[k], mask) for j, other in enumerate(seen) if j != k):
+            placed.append((k, pixels))
+            points = np.concatenate([points, new])
+    return _made(like, seen, placed, points, seed)
+
+
+def _seen(gaussians: Gaussians, view: TrainingView) -> _Seen:
+    assert view.labels is not None  # checked by the caller
+    labels = view.labels.numpy().astype(np.int64)
+    depth = surface_depth(gaussians, replace(view, depth=None))
+    area = np.bincount(labels.ravel())
+    area[0] = 0
+    one = _Seen(view, labels, depth, area, np.zeros(len(area), np.int64))
+    label, z = one.shown(gaussians.means.double().numpy())
+    size = gaussians.log_scales.amax(dim=1).exp().numpy() * float(view.K[0, 0]) / np.maximum(z, 1e-6)
+    fits = (size <= WITHIN * np.sqrt(area[label] / np.pi)) & (gaussians.opacities.numpy() >= SOLID)
+    return replace(one, own=np.bincount(label[fits], minlength=len(area)))
+
+
+def _spread(mask: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """About WANTED pixels [P, 2] of `mask` [H, W] with depth, on a grid."""
+    rows, columns = np.nonzero(mask & (depth > 0))
+    step = max(1.0, np.sqrt(len(rows) / WANTED))
+    cell = np.floor(rows / step).astype(np.int64) * mask.shape[1] + np.floor(columns / step).astype(np.int64)
+    first = np.unique(cell, return_index=True)[1]
+    return np.stack([rows, columns], axis=1)[np.sort(first)][: 2 * WANTED]
+
+
+def _confirms(other: _Seen, points: np.ndarray, seen: _Seen, mask: int) -> bool:
+    """Whether `other` shows points [P, 3] of a mask of `seen` in one mask that is as large as it should be there."""
+    label, z = other.shown(points)
+    counts = np.bincount(label, minlength=1)
+    counts[0] = 0
+    best = int(counts.argmax())
+    if counts[best] < AGREE * len(points) or other.area[best] < LEAST_PIXELS:
+        return False
+    nearer = float(np.median(seen.shown(points)[1]) / np.median(z)) * float(other.view.K[0, 0] / seen.view.K[0, 0])
+    expected = seen.area[mask] * nearer**2
+    return bool(expected / ALIKE <= other.area[best] <= expected * ALIKE)
+
+
+def _made(
+    like: Gaussians, seen: list[_Seen], placed: list[tuple[int, np.ndarray]], points: np.ndarray, seed: int
+) -> Gaussians:
+    """Balls at points [P, 3], which are those of the pixels in `placed`, as large as their distance there."""
+    colors, sizes = [np.zeros((0, 3))], [np.zeros(0)]
+    for k, pixels in placed:
+        view, depth = seen[k].view, seen[k].depth[tuple(pixels.T)]
+        gain = 1.0 if view.gain is None else view.gain.numpy()
+        colors.append(view.photo.numpy()[tuple(pixels.T)] / 255 / gain)
+        step = np.sqrt(seen[k].area[seen[k].labels[tuple(pixels.T)]] / len(pixels))
+        sizes.append(0.5 * step * depth / float(view.K[0, 0]))
+    rgb, scale = (torch.from_numpy(np.concatenate(rows).astype(np.float32)) for rows in (colors, sizes))
+    generator = torch.Generator().manual_seed(seed)
+    balls = isotropic(points, scale.clamp(min=1e-9).log(), rgb, OPACITY, like.features.shape[1], generator)
+    return replace(balls, sh=torch.cat([balls.sh, balls.sh.new_zeros(len(points), like.sh.shape[1] - 1, 3)], dim=1))
