@@ -29,15 +29,15 @@ from perception.visits.motion import (
     CERTAIN,
     CLOSE,
     HOPELESS,
+    LOOKS,
     MOVED,
     TWINS,
     Motion,
     assigned,
-    carried,
-    looks_alike,
     motions_of,
     settled,
 )
+from perception.visits.registration import carried, looks_alike
 from perception.visits.visit import Visit, gaussians_of
 
 UP = (0.0, 0.0, 1.0)
@@ -83,8 +83,10 @@ def seen_today(visit: Visit) -> Today:
     new = new_surface(looks, held, run.config.train.budget or len(visit.gaussians), run.config.seed)
     progress.log(f"{len(gone)} things do not stand where they stood; {len(new)} points of new surface")
     config = update_config(run.config, len(visit.photos.views), GROWING, len(held) + SPARE * len(new))
-    together = Gaussians.concatenate([held, new])
-    grown, record = trained(run, "grow", visit.mark, visit.masks["identity"], together, len(held), visit.photos, config)
+    grown, record = held, TrainRecord()
+    if len(new):
+        both, mark = Gaussians.concatenate([held, new]), visit.masks["identity"]
+        grown, record = trained(run, "grow", visit.mark, mark, both, len(held), visit.photos, config)
 
     with run.stage("instances"):
         rows = np.arange(len(held), len(grown))
@@ -149,6 +151,7 @@ def _moved(
     depth = {entry["id"]: min(entry["obb"]["extent"]) for entry in visit.gmap.instances}
     gravity = visit.gmap.info.get("gravity")
     up = np.array(UP) if gravity is None else -np.array(gravity["direction"], np.float64)
+    frames = visit.frames
     odds, motions = np.full((len(gone), len(things)), -np.inf), dict[tuple[int, int], Motion]()
     for j, (own, _) in enumerate(things):
         new = grown.rows(torch.from_numpy(own))
@@ -158,10 +161,10 @@ def _moved(
         for a in likely:
             if odds[:, j].max() > CERTAIN and alike[a] < alike[likely[0]] - TWINS:
                 break
-            found, cuts = motions_of(olds[gone[a]], new, visit.frames, rest, up, depth[gone[a]])
-            if not found or found[0][0].same < HOPELESS:
+            found, cuts = motions_of(olds[gone[a]], new, frames, rest, up, depth[gone[a]])
+            if not found or found[0][0].same + LOOKS[0] * (alike[a] - LOOKS[1]) < HOPELESS:
                 continue
-            motion = settled(olds[gone[a]], found, cuts, depth[gone[a]], alike[a])
+            motion = settled(olds[gone[a]], found, cuts, up, depth[gone[a]], alike[a])
             odds[a, j], motions[a, j] = motion.odds, motion
         visit.run.progress.update("motions", j + 1, len(things))
     pairs = {}
