@@ -29,6 +29,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from perception.errors import InputError
+from perception.geometry import move_points, scale_of
 from perception.io.json_shapes import Count, Matrix3, Moment, PathText, Point, Pose, Share, Sides
 
 State = Literal["moved", "removed", "added", "unchanged", "unseen"]
@@ -169,6 +170,19 @@ def _change(entry: dict[str, Any], start: int, newest: int) -> dict[str, Any] | 
         change["ambiguous"] = any(spot.get("ambiguous", False) for spot in later)
         change["axis"] = next((spot["axis"] for spot in reversed(later) if "axis" in spot), None)
     return change
+
+
+def change_in(a_from_b: np.ndarray, change: dict[str, Any]) -> dict[str, Any]:
+    """A change of `changes_of` in frame a, from frame b; a_from_b [4, 4]: a similarity."""
+    moved = dict(change)
+    for key in ("old_centroid", "new_centroid"):
+        if change[key] is not None:
+            moved[key] = move_points(a_from_b, np.array(change[key])).tolist()
+    if change["transform"] is not None:
+        moved["transform"] = (a_from_b @ np.array(change["transform"]) @ np.linalg.inv(a_from_b)).tolist()
+    if change.get("axis") is not None:
+        moved["axis"] = (a_from_b[:3, :3] @ np.array(change["axis"]) / scale_of(a_from_b)).tolist()
+    return moved
 
 
 def _motion(spots: Iterable[dict[str, Any]]) -> list[list[float]] | None:

@@ -1,13 +1,13 @@
-"""Scores `perception update` over visits of made scenes of several seeds, each visit against the one before.
+"""Scores `perception update` over visits of made scenes of several seeds, in a row.
 
-python tools score.made_visits tabletop|room WORK --seeds N ... [--visits N] [--side PX] [--views N] [--share KIND=X ...]
-    [--corner SHARE] [--masks labels|labels_sam|builtin] [--alone] [--apart] [--set KEY=VALUE ...]
+python tools score.made_visits tabletop|room WORK --seeds N ... [--visits N] [--side PX] [--views N]
+    [--share KIND=X ...] [--corner SHARE] [--masks labels|labels_sam|builtin] [--alone] [--apart] [--set KEY=VALUE ...]
 
 Makes the visits of `worlds.visits` (400 × 300 pixels, 36 or 56 photos), the map of the first one (1000 iterations,
-without language), and updates it visit after visit. A row for each visit, then mean, spread and worst over all of them, and what came true
-of the states, by confidence. Given poses, unless --alone. --share: of the things, by kind of change (moved, turned,
-removed, added, swapped); none=0: only the light changes. --corner: later visits use that share of their photos, the
-first ones by name. --apart: also a new map of every visit, for its PSNR and its CPU seconds.
+without language), and updates it visit after visit. A row for each visit, then mean, spread and range over all of them,
+and what came true of the states, by confidence. Given poses, unless --alone. --share: of the things, by kind of change
+(moved, turned, removed, added, swapped); none=0: only the light changes. --corner: later visits use that share of their
+photos, the first ones by name. --apart: also a new map of every visit, for its PSNR and its CPU seconds.
 """
 
 from __future__ import annotations
