@@ -20,7 +20,7 @@ from perception.rasterizer.rasterize import rasterizer_for
 from perception.rasterizer.types import Settings
 from perception.visits.evidence import Signs, signs_from, sums_in
 from perception.visits.look import Look, blurred, projected
-from perception.visits.registration import BEST, TURNED, YAWS, Points, angle_between, register, turns
+from perception.visits.registration import BEST, TURNED, YAWS, Points, angle_between, looks_round, register, turns
 
 VISIBLE, TOUCHING = 0.3, 0.02
 """Least opacity of a pixel that shows a thing; relative depth by which it may lie behind what it stands on."""
@@ -55,6 +55,8 @@ LOOKS = 8.0, 0.45
 things share .5 to .75 between visits, others up to .5."""
 CLOSE = 1.5
 """Log-odds within which two motions, or two look-alikes, cannot be told apart."""
+PRINT = 7.0
+"""Log-odds that a wrong turn of printed things costs at least; the shades of a plain round thing cost up to 6."""
 
 
 @dataclass(frozen=True)
@@ -258,15 +260,17 @@ def settled(
 
 
 def round_about(old: Gaussians, motion: Found, cuts: Sequence[Cut], up: np.ndarray, depth: float) -> np.ndarray | None:
-    """The axis [3] about which no turn of a moved thing changes what the photos say: the vertical `up`, or one of the
-    main axes of its points; None where there is none."""
-    (signs, pose), points = motion, Points.of(old).points
-    middle = pose[:3, :3] @ np.median(points, axis=0) + pose[:3, 3]
-    for axis in (up, *(pose[:3, :3] @ np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2].T).T):
-        about = turns(axis, YAWS)
-        motions = [_about(turn, middle) @ pose for turn in about[1:]]
-        if all(turned.same > signs.same - CLOSE for turned, _ in judged(old, motions, cuts, depth)):
-            return np.asarray(axis)
+    """The axis [3] about which a moved thing looks round, by its points and by the photos; None where there is none.
+    It is the vertical `up`, or one of the main axes of the points. Shades turn with a thing, though light does not."""
+    (signs, pose), points = motion, Points.of(old)
+    middle = pose[:3, :3] @ np.quantile(points.points, [0.02, 0.98], axis=0).mean(axis=0) + pose[:3, 3]
+    main = np.linalg.svd(points.points - points.points.mean(axis=0), full_matrices=False)[2]
+    for axis in (pose[:3, :3].T @ up, *main):
+        if looks_round(points, axis):
+            after = pose[:3, :3] @ axis
+            turned = judged(old, [_about(turn, middle) @ pose for turn in turns(after, YAWS)[1:]], cuts, depth)
+            if min(each.same for each, _ in turned) > signs.same - PRINT:
+                return np.asarray(after)
     return None
 
 

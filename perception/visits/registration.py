@@ -30,6 +30,10 @@ SOLID = 0.1
 """Least opacity of a Gaussian that shows a surface."""
 REACH = 2.2
 """Radii of a thing (root of the mean squared distance to its centre) within which all of it lies."""
+ROUND, DARKEST = 1.6, 0.1
+"""Distance of the points of a thing after a turn, relative to that between its halves, up to which it may be round:
+bowls and plates have 1.1 to 1.4, cans and cartons, whose print the photos see, 1.4 to 2.4. Least sum of colours of a
+hue."""
 BINS = 6
 """Of each colour in the histograms of things."""
 
@@ -169,6 +173,26 @@ def harmonics(d: np.ndarray) -> np.ndarray:
         -0.4570457994644658 * x * (4 * zz - xx - yy), 1.445305721320277 * z * (xx - yy),
         -0.5900435899266435 * x * (xx - 3 * yy),
     ], axis=1)  # fmt: skip
+
+
+def looks_round(points: Points, axis: np.ndarray) -> bool:
+    """Whether turns about an axis [3] through the middle of a thing put its points, with their hues, onto each other
+    about as well as one half of them lies on the other half."""
+    from scipy.spatial import cKDTree
+
+    x = points.points / max(points.radius, 1e-9)
+    hues = points.colors / np.maximum(points.colors.sum(axis=1, keepdims=True), DARKEST)
+    middle = np.quantile(x, [0.02, 0.98], axis=0).mean(axis=0)
+    order = np.random.default_rng(0).permutation(len(x))[: 4 * FINE]
+    one, other = order[::2], order[1::2]
+    tree = cKDTree(np.concatenate([x[one], hues[one]], axis=1))
+
+    def off(turn: np.ndarray) -> float:
+        turned = (x[other] - middle) @ turn.T + middle
+        return float(np.quantile(tree.query(np.concatenate([turned, hues[other]], axis=1))[0], 0.9))
+
+    unturned, *turned = map(off, turns(axis, YAWS))
+    return max(turned) < ROUND * unturned
 
 
 def looks_alike(old: Gaussians, new: Gaussians) -> float:

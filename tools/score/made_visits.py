@@ -102,7 +102,9 @@ def scored(folder: Path, given: argparse.Namespace) -> list[dict[str, Any]]:
 def show(name: str, row: dict[str, Any]) -> None:
     """One line."""
     cells = [f"{column} {row[column]:.3g}" for column in COLUMNS if row.get(column) is not None]
-    states = ", ".join(f"{state} {values['f1']:.2f} of {values['true']}" for state, values in row["states"].items())
+    states = ", ".join(
+        f"{state} {values['f1']:.2f} of {values['true']}" for state, values in row["states"].items() if values["true"]
+    )
     print(f"{name}: {', '.join(cells)}; F1 of {states}; wrong: {'; '.join(row['wrong'])}", flush=True)
 
 

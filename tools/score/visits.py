@@ -139,10 +139,11 @@ def scores(changes: list[dict[str, Any]], first: Map, second: Map, truth: Truth)
         }
         for state in STATES
     }
+    known = [table[state]["f1"] for state in CHANGED if table[state]["true"]]
     median = [_median(column) for column in np.array(errors).reshape(-1, 3).T]
     return {
         "states": table,
-        "f1": float(np.mean([table[state]["f1"] for state in CHANGED if table[state]["true"]] or [0])),
+        "f1": float(np.mean(known)) if known else None,
         "false_alarms": alarms / max(1, unchanged), "unseen_called_removed": lost / max(1, unseen),
         "motion_cm": median[0], "nearest_cm": median[1], "motion_degrees": median[2], "turns_unknown": blind,
         "ids_kept": float(np.mean(kept)) if kept else None, "told": came, "wrong": errant,
@@ -192,7 +193,7 @@ def naive(first: Map, second: Map) -> list[dict[str, Any]]:
 
 
 def show(name: str, result: dict[str, Any]) -> None:
-    print(f"{name}: mean F1 of moved, removed and added {result['f1']:.3f}")
+    print(f"{name}: mean F1 of moved, removed and added {result['f1'] or float('nan'):.3f}")
     for state, row in result["states"].items():
         print(f"  {state:10s} P {row['precision']:.2f}  R {row['recall']:.2f}  F1 {row['f1']:.2f}  of {row['true']}")
     rest = {key: value for key, value in result.items() if key not in ("states", "f1", "told", "wrong")}
