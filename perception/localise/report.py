@@ -58,11 +58,16 @@ def answer_json(answer: Localised | NotHere) -> dict[str, Any]:
     }
 
 
+def rendered_notice(gmap: Map, rendered: list[str]) -> str:
+    """That the photos of the views `rendered` are not at hand."""
+    many = f"{len(rendered)} of {len(gmap.views)} photos of the map"
+    return f"{gmap.path}: {many} are not at hand; its own pictures are used"
+
+
 def _lines(answers: Sequence[Localised | NotHere], gmap: Map, rendered: list[str]) -> list[str]:
     unit, lines = "m" if gmap.metric else "map units", []
     if rendered:
-        what = f"{len(rendered)} of {len(gmap.views)} photos of the map are not at hand; its own pictures are used"
-        lines.append(f"warning: {gmap.path}: {what} (--photos DIR gives their folder)")
+        lines.append(f"warning: {rendered_notice(gmap, rendered)} (--photos DIR gives their folder)")
     for answer in answers:
         if isinstance(answer, NotHere):
             lines.append(f"{answer.name}: {answer.why}")

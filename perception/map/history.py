@@ -11,7 +11,8 @@ past             where it stood before, oldest first: {"until", "centroid", "obb
                  until: the visit before the one that found it to stand there no more, so entries ascend. transform:
                  [4, 4] that takes points from there to where it stood next (the next entry, else today's spot); null
                  where that is not known, as for a removed thing. ambiguous: another motion, or another thing that looks
-                 alike, explains the visit as well. "gone": true: it was away until that visit; it has come back since.
+                 alike, explains the visit as well. axis: [3] about which its turn is not known, as it looks round.
+                 "gone": true: it was away until that visit; it has come back since.
 
 A removed instance stays in instances.json and language.npz, with `num_gaussians` 0 and its last box; the last entry of
 its `past` is the spot that it left. past.npz holds the means of what stood elsewhere: means [M, 3] float32, ids [M]
@@ -28,6 +29,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from perception.errors import InputError
+from perception.geometry import move_points, scale_of
 from perception.io.json_shapes import Count, Matrix3, Moment, PathText, Point, Pose, Share, Sides
 
 State = Literal["moved", "removed", "added", "unchanged", "unseen"]
@@ -38,7 +40,7 @@ AABB = {"min": Point, "max": Point}
 VISIT = {"time": Moment | None, "input": PathText, "photos": Count}
 PAST = {
     "until": Count, "centroid": Point, "obb": OBB, "aabb?": AABB, "transform": Pose | None, "ambiguous?": bool,
-    "gone?": bool,
+    "gone?": bool, "axis?": Point,
 }  # fmt: skip
 RECORD = {
     "state?": State, "confidence?": Share, "first_seen?": Count, "last_seen?": Count, "last_looked_for?": Count,
@@ -132,7 +134,7 @@ def changes_of(visits: Sequence[Visit], instances: list[dict[str, Any]], start: 
 
     One dict per instance that stood then or stands today: state, instance_id, label, confidence, old_centroid,
     new_centroid (None where it stood or stands nowhere), transform ([4, 4] new_from_old, None where it is not known),
-    last_seen (number of a visit); of a moved or removed one also since, the visit that found it so, and ambiguous.
+    last_seen (number of a visit); of a moved or removed one also since (the visit that found it so), ambiguous, axis.
     unseen: no visit after `start` saw it, and none missed it. confidence: that of the newest visit.
     """
     changes = [change for entry in instances if (change := _change(entry, start, len(visits) - 1)) is not None]
@@ -166,7 +168,21 @@ def _change(entry: dict[str, Any], start: int, newest: int) -> dict[str, Any] | 
     if state in ("moved", "removed"):
         change["since"] = since(entry)
         change["ambiguous"] = any(spot.get("ambiguous", False) for spot in later)
+        change["axis"] = next((spot["axis"] for spot in reversed(later) if "axis" in spot), None)
     return change
+
+
+def change_in(a_from_b: np.ndarray, change: dict[str, Any]) -> dict[str, Any]:
+    """A change of `changes_of` in frame a, from frame b; a_from_b [4, 4]: a similarity."""
+    moved = dict(change)
+    for key in ("old_centroid", "new_centroid"):
+        if change[key] is not None:
+            moved[key] = move_points(a_from_b, np.array(change[key])).tolist()
+    if change["transform"] is not None:
+        moved["transform"] = (a_from_b @ np.array(change["transform"]) @ np.linalg.inv(a_from_b)).tolist()
+    if change.get("axis") is not None:
+        moved["axis"] = (a_from_b[:3, :3] @ np.array(change["axis"]) / scale_of(a_from_b)).tolist()
+    return moved
 
 
 def _motion(spots: Iterable[dict[str, Any]]) -> list[list[float]] | None:

@@ -245,7 +245,9 @@ def _change_row(
     if old and new:
         length = float(np.linalg.norm(np.subtract(new, old)))
         parts.append(f"by {100 * length:.0f} cm" if metric else f"by {length:.3f}")
-    if change["transform"] is not None:
+    if change.get("axis") is not None:
+        parts.append("looks round, so its turn is not known")
+    elif change["transform"] is not None:
         rotation = Rotation.from_matrix(np.array(change["transform"])[:3, :3])
         parts.append(f"turned {np.degrees(rotation.magnitude()):.0f}°")
     if change["state"] == "removed":

@@ -52,7 +52,8 @@ class ChangesAnswer(Answer):
     since: int = Field(description="the visit that today is compared with")
     changes: list[dict[str, Any]] = Field(
         description="of each thing: state (moved, removed, added, unchanged; unseen: nobody looked), instance_id, "
-        "label, names, confidence, old_centroid, new_centroid, transform (new_from_old), last_seen (a visit)"
+        "label, names, confidence, old_centroid, new_centroid, transform (new_from_old), last_seen (a visit); "
+        "axis: its turn about this is not known"
     )
     visits: list[dict[str, Any]]
 

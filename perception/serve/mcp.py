@@ -23,6 +23,7 @@ from scipy.spatial import cKDTree
 from perception import __version__
 from perception.errors import InputError, missing_extra
 from perception.geometry import scale_of
+from perception.map.history import change_in
 from perception.query import Frame, Hit, QueryMap, Where
 from perception.query.crops import OUTSIDE, PhotoOutside, best_crop, photos_outside
 from perception.query.hit import printed_texts
@@ -116,17 +117,16 @@ class Find(Tool):
 
 
 class WhatChanged(Tool):
-    """What moved, came and went since an earlier visit of the scene, and what nobody looked at. In the map's frame."""
+    """What moved, came and went since an earlier visit of the scene, and what nobody looked at."""
 
     answer = ChangesAnswer
     since: Visit | None = Field(None, description="a visit; else the one before the newest")
 
     def fields_of(self, gmap: QueryMap, frame: Frame | None, photos: Path | None) -> dict[str, Any]:
-        if frame is not None:
-            raise UnknownFrame(f"frame: changes are in the map's own, '{gmap.frame}'; ask without frame")
         facts, known = gmap.changes_json("last" if self.since is None else self.since), gmap.last_known
         names = dict(zip((entry["id"] for entry in known.instances), _names(known), strict=True))
-        changes = [{**change, "names": names.get(change["instance_id"], [])} for change in facts["changes"]]
+        told = facts["changes"] if frame is None else [change_in(frame.from_map, each) for each in facts["changes"]]
+        changes = [{**change, "names": names.get(change["instance_id"], [])} for change in told]
         sure = [change["confidence"] for change in changes if change["confidence"] is not None]
         return {key: facts[key] for key in ("since", "visits")} | {
             "changes": changes,

@@ -77,15 +77,16 @@ def signs_of(looks: Sequence[Look], things: Sequence[int], shares: np.ndarray, d
         for thing in np.unique(shown.ids[shown.ids >= 0]).tolist():
             if thing in number:
                 n = number[thing]
-                sums[n] += _in_photo(shown, shown.ids == thing, labels, areas, measured, depths[n])
-    return [_signs(row, float(share)) for row, share in zip(sums, shares, strict=True)]
+                sums[n] += sums_in(shown, shown.ids == thing, labels, areas, measured, depths[n])
+    return [signs_from(row, float(share)) for row, share in zip(sums, shares, strict=True)]
 
 
-def _in_photo(
+def sums_in(
     shown: Look, mask: np.ndarray, labels: np.ndarray, areas: np.ndarray, measured: np.ndarray, depth: float
 ) -> np.ndarray:
-    """The sums of 11: photos, pixels, covariance, variances (2), IoU × pixels, labelled pixels, colour, rays measured,
-    through and hit."""
+    """Of a thing in a photo, the sums of 11: photos, pixels, covariance, variances (2), IoU × pixels, labelled pixels,
+    colour, rays measured, through and hit. mask [h, w]: of the thing; areas: pixels of each of the `labels` [h, w];
+    measured [h, w] bool; depth: smallest extent of the thing."""
     near = shown.mapped * (1 - AGREE) - depth
     mask = mask & ~(measured & (shown.measured < near))
     pixels = int(mask.sum())
@@ -98,12 +99,13 @@ def _in_photo(
     known = measured & mask
     ratio = shown.measured[known] / np.maximum(shown.mapped[known], 1e-6)
     sums = [shown.product[mask].sum(), shown.rendered[mask].sum(), shown.shown[mask].sum()]
-    outline = [iou * pixels, pixels] if labels.any() else [0, 0]
+    outline = [iou * pixels, pixels] if areas[0] < labels.size else [0, 0]
     rays = [len(ratio), (ratio > 1 + AGREE).sum(), (np.abs(ratio - 1) <= AGREE).sum()]
     return np.array([1, pixels, *sums, *outline, shown.colour[mask].sum(), *rays], np.float64)
 
 
-def _signs(row: np.ndarray, share: float) -> Signs:
+def signs_from(row: np.ndarray, share: float) -> Signs:
+    """The signs whose sums over all photos are `row` [11]."""
     photos, pixels, product, a, b, outline, labelled, colour, measured, through, hit = row.tolist()
 
     def over(x: float, y: float) -> float:

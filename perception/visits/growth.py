@@ -11,7 +11,7 @@ import torch
 from perception.config import MapConfig
 from perception.gaussians.depth_start import start_on_surface
 from perception.gaussians.model import Gaussians
-from perception.gaussians.state import TrainRecord, sized
+from perception.gaussians.state import USUAL_PHOTOS, TrainRecord, sized
 from perception.gaussians.train import Trainer
 from perception.instances.assign import LEAST_AGREEMENT, affinities, mask_shares
 from perception.instances.group import Grouping, group
@@ -22,7 +22,7 @@ from perception.visits.evidence import AGREE, LEAST_PIXELS, WEIGHTS
 from perception.visits.look import Look, correlation
 
 GROWING, SETTLING = 0.16, 0.1
-"""Iterations of the two legs of an update, relative to those of a new map of as many photos."""
+"""Iterations of the two legs of an update, relative to those of a new map."""
 LEAST_ITERATIONS = 100
 SHIFTED = 0.01
 """Relative difference of depth from which a pixel of a mask that the map does not explain shows a new surface."""
@@ -67,7 +67,9 @@ def new_surface(looks: Sequence[Look], like: Gaussians, budget: int, seed: int) 
 
 
 def update_config(config: MapConfig, photos: int, share: float, start: int) -> MapConfig:
-    """The settings of one leg of training: `share` of the iterations of a new map; few Gaussians beyond `start`."""
+    """The settings of one leg of training: `share` of the iterations of a new map, fewer for a few photos, as these see
+    little; at most `start` Gaussians."""
+    share *= min(1.0, photos / USUAL_PHOTOS)
     iterations = max(LEAST_ITERATIONS, round(share * sized(config, photos).train.iterations))
     train = config.train.model_copy(update={"iterations": iterations, "budget": max(1, start)})
     return config.model_copy(update={"train": train})

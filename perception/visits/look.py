@@ -137,12 +137,13 @@ def look(gaussians: Gaussians, ids: np.ndarray, view: TrainingView, measured: np
 def moments(image: np.ndarray, photo: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Local covariance of two images [h, w, 3] in brightness, and their variances, each [h, w]."""
     a, b = (cv2.cvtColor(np.ascontiguousarray(x), cv2.COLOR_RGB2GRAY) for x in (image, photo))
+    mean_a, mean_b = blurred(a), blurred(b)
+    return blurred(a * b) - mean_a * mean_b, blurred(a * a) - mean_a**2, blurred(b * b) - mean_b**2
 
-    def mean(x: np.ndarray) -> np.ndarray:
-        return np.asarray(cv2.GaussianBlur(x, (0, 0), WINDOW))
 
-    mean_a, mean_b = mean(a), mean(b)
-    return mean(a * b) - mean_a * mean_b, mean(a * a) - mean_a**2, mean(b * b) - mean_b**2
+def blurred(image: np.ndarray) -> np.ndarray:
+    """Local means of an image [h, w]."""
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), WINDOW))
 
 
 def correlation(product: float, a: float, b: float) -> float:

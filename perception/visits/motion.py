@@ -1,51 +1,37 @@
 """Which new thing of a visit is which thing that no longer stands where it stood, and how it moved.
 
-Two things are compared by registration: the points of the new one, with their colours, are brought onto those of the
-old one (ICP, Besl and McKay 1992) from many starting rotations. The best few motions are then judged by the photos, by
-the same signs as a thing that did not move: carried to the new spot, would the photos say that it stands there? All
-pairs are assigned jointly.
+Two things are compared by registration of their points. The best few motions are then judged by the photos, by the same
+signs as a thing that did not move: carried to the new spot, would the photos say that it stands there? All pairs are
+assigned jointly.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import cached_property
 
 import numpy as np
 import torch
 
 from perception.gaussians.model import Gaussians
 from perception.gaussians.views import TrainingView, expected_depth, render
-from perception.geometry import nearest_rotation, rotations
-from perception.visits.evidence import Signs, signs_of
-from perception.visits.look import Look, moments, projected
+from perception.rasterizer.rasterize import rasterizer_for
+from perception.rasterizer.types import Settings
+from perception.visits.evidence import Signs, signs_from, sums_in
+from perception.visits.look import Look, blurred, projected
+from perception.visits.registration import BEST, TURNED, YAWS, Points, angle_between, looks_round, register, turns
 
-YAWS = 12
-"""Starting rotations about the vertical; the 24 that map a cube's axes to each other are tried as well."""
-ROUGH, FINE, BEST = 150, 600, 4
-"""Points of the new thing in the first rounds of all starts, and in the last rounds of the BEST ones."""
-ROUNDS = (6, 25)
-TRIMMED = 0.8
-"""Share of the new points that are compared: the rest are of neighbours, or were hidden in the first visit."""
-COLOUR = 1.0
-"""Radii of a thing that a difference of colour of 1 counts as."""
 VISIBLE, TOUCHING = 0.3, 0.02
 """Least opacity of a pixel that shows a thing; relative depth by which it may lie behind what it stands on."""
-SOLID = 0.1
-"""Least opacity of a Gaussian that shows a surface."""
-REACH = 2.2
-"""Radii of a thing (root of the mean squared distance to its centre) within which all of it lies."""
 SIZES, LEAST_PART = (0.35, 1.6), 0.3
 """Least and largest size of the new thing relative to the old one, which may be half hidden; least share of its points
 that lie within reach of each other, if it is that thing."""
 JUDGED, LARGE, SMALL = 4, 128, 48
-"""Photos by which a motion is judged: those that show most of the new thing; the long side in pixels from which their
-parts are halved, and from which they are to find a motion at first, when it may be far off."""
+"""Photos by which a motion is judged: those that show most of the new thing, from other sides; the long side in pixels
+from which their parts are halved, and from which they are to find a motion at first, when it may be far off."""
 MARGIN = 0.3
 """Of the cut around a thing in a photo, relative to its sides."""
-TURNED = 15.0
-"""Degrees from which two motions are different ones."""
 HOPELESS = -4.0
 """Log-odds of a first guess below which a motion is not refined."""
 ALIKE = 2
@@ -56,158 +42,33 @@ TWINS = 0.15
 """Difference of what two histograms have in common, within which two things are as much alike."""
 MOVED = 1.2
 """Least log-odds for which a new thing is an old one."""
-GAINS = 0.02
-"""Log-odds that a step of refinement must gain."""
-ROUGH_STEP, STEP, LEAST_STEP = 0.4, 0.1, 0.015
+GAINS, SHORTER = 0.1, 3
+"""Log-odds below which a gain of refinement makes its steps shorter, and how much."""
+BEHIND = 5.0
+"""Log-odds by which a first guess may be behind the best one, to be refined as well."""
+GRAY = np.array([0.299, 0.587, 0.114], np.float32)
+"""Brightness of a colour."""
+ROUGH_STEP, STEP, LEAST_STEP = 0.4, 0.1, 0.03
 """Steps of a motion in refinement, from a rough one down: radii of the thing, and radians."""
-BINS = 6
-"""Of each colour in the histograms of things."""
 LOOKS = 8.0, 0.45
 """Log-odds of being one thing per unit of what two histograms have in common, and where that says nothing: the same
 things share .5 to .75 between visits, others up to .5."""
 CLOSE = 1.5
 """Log-odds within which two motions, or two look-alikes, cannot be told apart."""
-
-
-@dataclass(frozen=True)
-class Points:
-    """Of one thing: points [P, 3] float64, colors [P, 3] in [0, 1]."""
-
-    points: np.ndarray
-    colors: np.ndarray
-
-    @classmethod
-    def of(cls, gaussians: Gaussians) -> Points:
-        """The means and colours of the solid Gaussians."""
-        solid = gaussians.opacities.numpy() >= SOLID
-        return cls(gaussians.means.double().numpy()[solid], gaussians.base_colors.double().numpy()[solid].clip(0, 1))
-
-    def within(self, radius: float) -> Points:
-        """The points in the ball about the densest spot in which a thing of this `radius` fits; strays are left out."""
-        from scipy.spatial import cKDTree
-
-        if len(self.points) == 0:
-            return self
-        counts = cKDTree(self.points).query_ball_point(self.points, radius, return_length=True)
-        centre = self.points[int(np.argmax(counts))]
-        for _ in range(ROUNDS[0]):
-            kept = np.linalg.norm(self.points - centre, axis=1) <= REACH * radius
-            centre = np.median(self.points[kept], axis=0)
-        return Points(self.points[kept], self.colors[kept])
-
-    @property
-    def radius(self) -> float:
-        """Root of the mean squared distance to the centre."""
-        return float(np.sqrt(((self.points - self.points.mean(axis=0)) ** 2).sum(axis=1).mean()))
-
-    def some(self, count: int) -> Points:
-        """An even selection of at most about `count` points."""
-        every = max(1, len(self.points) // count)
-        return Points(self.points[::every], self.colors[::every])
+PRINT = 7.0
+"""Log-odds that a wrong turn of printed things costs at least; the shades of a plain round thing cost up to 6."""
 
 
 @dataclass(frozen=True)
 class Motion:
     """new_from_old [4, 4] of a thing; odds: log-odds that it is the same thing, by the photos and by its colours;
-    ambiguous: another motion explains the photos as well."""
+    ambiguous: another motion explains the photos as well. axis [3]: unit vector about which all turns do, so that the
+    thing looks round and its turn is not known; None for others."""
 
     new_from_old: np.ndarray
     odds: float
     ambiguous: bool = False
-
-
-def register(old: Points, new: Points, up: np.ndarray) -> list[tuple[float, np.ndarray]]:
-    """(mean residual in radii of the old thing, new_from_old [4, 4]) of the best motions, the best first, and of all
-    turns about the vertical that differ from them: points of a half hidden thing alone cannot tell."""
-    from scipy.spatial import cKDTree
-
-    radius = max(old.radius, 1e-9)
-    tree = cKDTree(np.concatenate([old.points / radius, COLOUR * old.colors], axis=1))
-    middle_old, middle_new = (np.median(each.points, axis=0) for each in (old, new))
-    starts = []
-    for rotation in _starts(up):
-        start = np.eye(4)
-        start[:3, :3], start[:3, 3] = rotation, middle_new - rotation @ middle_old
-        starts.append(_icp(tree, old, new.some(ROUGH), start, radius, ROUNDS[0]))
-    likely = sorted(starts, key=lambda found: found[0])[: 2 * BEST]
-    fine = [_icp(tree, old, new.some(FINE), start, radius, ROUNDS[1]) for _, start in likely]
-    distinct: list[tuple[float, np.ndarray]] = []
-    for found in [*sorted(fine, key=lambda found: found[0]), *starts[:YAWS]]:
-        if all(angle_between(found[1], other[1]) > TURNED for other in distinct):
-            distinct.append(found)
-    return distinct
-
-
-def _starts(up: np.ndarray) -> list[np.ndarray]:
-    from scipy.spatial.transform import Rotation
-
-    turns = Rotation.from_rotvec(np.arange(YAWS)[:, None] * (2 * np.pi / YAWS) * up).as_matrix()
-    return [*turns, *Rotation.create_group("O").as_matrix()]
-
-
-def _icp(
-    tree: Any, old: Points, new: Points, start: np.ndarray, radius: float, rounds: int
-) -> tuple[float, np.ndarray]:
-    pose, residual = start, np.inf
-    for _ in range(rounds):
-        back = (new.points - pose[:3, 3]) @ pose[:3, :3]
-        distance, nearest = tree.query(np.concatenate([back / radius, COLOUR * new.colors], axis=1))
-        kept = distance <= np.quantile(distance, TRIMMED)
-        residual = float(distance[kept].mean())
-        a, b = old.points[nearest[kept]], new.points[kept]
-        rotation = nearest_rotation((b - b.mean(axis=0)).T @ (a - a.mean(axis=0)))
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation, b.mean(axis=0) - rotation @ a.mean(axis=0)
-    return residual, pose
-
-
-def angle_between(a: np.ndarray, b: np.ndarray) -> float:
-    """Degrees between the rotations of two motions."""
-    cosine = (np.trace(a[:3, :3] @ b[:3, :3].T) - 1) / 2
-    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-
-
-def carried(gaussians: Gaussians, new_from_old: np.ndarray) -> Gaussians:
-    """The Gaussians of a thing moved by a rigid motion [4, 4], with their view-dependent colours."""
-    from scipy.spatial.transform import Rotation
-
-    rotation, shift = new_from_old[:3, :3], new_from_old[:3, 3]
-    means = gaussians.means.double().numpy() @ rotation.T + shift
-    turned = Rotation.from_matrix(rotation @ rotations(gaussians.quats.double().numpy())).as_quat()[:, [3, 0, 1, 2]]
-    return replace(
-        gaussians,
-        means=torch.from_numpy(means.astype(np.float32)),
-        quats=torch.from_numpy(np.ascontiguousarray(turned, np.float32)),
-        sh=turned_harmonics(gaussians.sh, rotation),
-    )
-
-
-def turned_harmonics(sh: torch.Tensor, rotation: np.ndarray) -> torch.Tensor:
-    """Coefficients [N, K, 3] of the same colours after a rotation [3, 3]: Y(d) sh' = Y(Rᵀ d) sh for
-    many directions d."""
-    count = sh.shape[1]
-    if count == 1:
-        return sh
-    directions = np.random.default_rng(0).normal(size=(64, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    turn = np.linalg.lstsq(harmonics(directions)[:, :count], harmonics(directions @ rotation)[:, :count], rcond=None)[0]
-    return torch.einsum("ij,njc->nic", torch.from_numpy(turn.astype(np.float32)), sh).contiguous()
-
-
-def harmonics(d: np.ndarray) -> np.ndarray:
-    """The real spherical harmonics [P, 16] of directions d [P, 3] as 3DGS orders and signs them."""
-    x, y, z = d.T
-    xx, yy, zz = x * x, y * y, z * z
-    return np.stack([
-        np.full_like(x, 0.28209479177387814),
-        -0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x,
-        1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (2 * zz - xx - yy),
-        -1.0925484305920792 * x * z, 0.5462742152960396 * (xx - yy),
-        -0.5900435899266435 * y * (3 * xx - yy), 2.890611442640554 * x * y * z,
-        -0.4570457994644658 * y * (4 * zz - xx - yy), 0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
-        -0.4570457994644658 * x * (4 * zz - xx - yy), 1.445305721320277 * z * (xx - yy),
-        -0.5900435899266435 * x * (xx - 3 * yy),
-    ], axis=1)  # fmt: skip
+    axis: np.ndarray | None = None
 
 
 # ------------------------------------------------------------------ judged by the photos
@@ -233,23 +94,49 @@ class Cut:
             cut = Cut(cut.view.halved(), cut.measured[part], image, cut.depth[part])
         return cut
 
-    def with_thing(self, thing: Gaussians) -> Look:
-        """The part beside a render of all else with a thing, which is instance 0: the nearer of the two surfaces."""
+    @cached_property
+    def _photo(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """[h, w, 3] colours in [0, 1]; [h, w] its brightness, the local mean and variance of that."""
+        photo = self.view.photo.numpy().astype(np.float32) / 255
+        gray = photo @ GRAY
+        mean = blurred(gray)
+        return photo, gray, mean, blurred(gray * gray) - mean**2
+
+    @cached_property
+    def _masks(self) -> tuple[np.ndarray, np.ndarray]:
+        """[h, w] int64 masks, 0 = none, and the pixels of each."""
+        labels = self.view.labels
+        images = np.zeros(self.depth.shape, np.int64) if labels is None else labels.numpy().astype(np.int64)
+        return images, np.bincount(images.ravel())
+
+    def sums(self, thing: Gaussians, motions: np.ndarray, smallest: float) -> np.ndarray:
+        """[P, 11] of `evidence.sums_in`, of a thing after each of the motions [P, 4, 4] before all else: the nearer of
+        two surfaces is seen. To move the camera the other way is the same as to move the thing. smallest: its least
+        extent."""
         view, (height, width) = self.view, self.depth.shape
-        out = render(thing, view.camera_from_world, view.K, width, height, harmonics=True, eps2d=view.eps2d)
+        photo, gray, mean, variance = self._photo
+        cameras = torch.from_numpy((view.camera_from_world.double().numpy() @ motions).astype(np.float32))
+        inputs = thing.inputs(view.camera_from_world, view.K, harmonics=True)
+        inputs = replace(inputs, viewmats=cameras, Ks=view.K.expand(len(motions), 3, 3).contiguous())
+        settings = Settings(width, height, sh_degree=thing.sh_degree, eps2d=view.eps2d, variance=False, depth=True)
+        out = rasterizer_for(thing.means.device).rasterize_forward(inputs, settings)
         assert out.depths is not None  # for the type checker
-        alpha = out.alphas[0].numpy()
-        depth = np.where(alpha > VISIBLE, out.depths[0].numpy() / np.maximum(alpha, 1e-6), np.inf)
-        front = depth < self.depth * (1 + TOUCHING)
-        weight = np.where(front, alpha, 0)[..., None]
-        own = np.where(front[..., None], view.exposed(out.colors[0]).numpy(), 0)
-        image = (own + (1 - weight) * self.image).clip(0, 1).astype(np.float32)
-        photo = view.photo.numpy().astype(np.float32) / 255
-        mapped = np.where(front, depth, np.where(np.isfinite(self.depth), self.depth, 0)).astype(np.float32)
-        ids = np.where(front, 0, -1)
-        if view.weight is not None:
-            ids[view.weight.numpy() == 0] = -1
-        return Look(view, mapped, self.measured, ids, *moments(image, photo), np.abs(image - photo).mean(axis=2))
+        alphas = out.alphas.numpy()
+        depths = np.where(alphas > VISIBLE, out.depths.numpy() / np.maximum(alphas, 1e-6), np.inf)
+        fronts = depths < self.depth * (1 + TOUCHING)
+        own = np.where(fronts[..., None], view.exposed(out.colors).numpy(), 0)
+        images = own + (1 - np.where(fronts, alphas, 0)[..., None]) * self.image
+        images = images.clip(0, 1).astype(np.float32)
+        mapped = np.where(fronts, depths, np.where(np.isfinite(self.depth), self.depth, 0)).astype(np.float32)
+        shown = fronts if view.weight is None else fronts & (view.weight.numpy() > 0)
+        colour = np.abs(images - photo).mean(axis=3)
+        rows = []
+        for n, image in enumerate(images @ GRAY):
+            local = blurred(image)
+            moment = blurred(image * gray) - local * mean, blurred(image * image) - local**2, variance
+            look = Look(view, mapped[n], self.measured, shown[n], *moment, colour[n])
+            rows.append(sums_in(look, shown[n], *self._masks, self.measured > 0, smallest))
+        return np.stack(rows)
 
 
 Frame = tuple[TrainingView, np.ndarray]
@@ -257,10 +144,25 @@ Frame = tuple[TrainingView, np.ndarray]
 
 
 def cuts_of(frames: Sequence[Frame], points: np.ndarray, scene: Gaussians) -> list[Cut]:
-    """The parts of the JUDGED photos that show most of a new thing, points [P, 3]. scene: all else."""
+    """The parts of the JUDGED photos that show most of a new thing, points [P, 3], each the more the farther it is from
+    the direction of those before it. scene: all else."""
     found = [(bounds, frame) for frame in frames if (bounds := _bounds(frame[0], points)) is not None]
-    found.sort(key=lambda cut: -int((cut[0][1] - cut[0][0]).prod()))
-    return [_cut(*frame, low, high, scene) for (low, high), frame in found[:JUDGED]]
+    if not found:
+        return []
+    areas = np.array([(high - low).prod() for (low, high), _ in found], float)
+    rays = np.stack([_centre(frame[0]) - points.mean(axis=0) for _, frame in found])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    chosen, apart = list[int](), np.ones(len(found))
+    while len(chosen) < min(JUDGED, len(found)):
+        chosen.append(int(np.argmax(areas * apart)))
+        apart = np.minimum(apart, np.arccos(np.clip(rays @ rays[chosen[-1]], -1, 1)) / np.pi)
+        apart[chosen] = -1
+    return [_cut(*found[n][1], *found[n][0], scene) for n in chosen]
+
+
+def _centre(view: TrainingView) -> np.ndarray:
+    pose = view.camera_from_world.double().numpy()
+    return np.asarray(-pose[:3, :3].T @ pose[:3, 3])
 
 
 def _bounds(view: TrainingView, points: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
@@ -309,9 +211,9 @@ def motions_of(
         return [], []
     starts = [pose for _, pose in register(a, b, up)] + _upright_starts(a, b, up)
     small = [cut.halved_to(SMALL) for cut in cuts]
-    rough = sorted(((judged(old, pose, small, depth), pose) for pose in starts), key=_falling)
-    rough = [refined(old, pose, small, depth, ROUGH_STEP, STEP) for _, pose in _distinct(rough)[:BEST]]
-    return sorted(((judged(old, pose, cuts, depth), pose) for _, pose in _distinct(rough)), key=_falling), cuts
+    first = _distinct(judged(old, starts, small, depth))[:BEST]
+    rough = [refined(old, found, small, depth, ROUGH_STEP, STEP) for found in first]
+    return sorted(judged(old, [pose for _, pose in _distinct(rough)], cuts, depth), key=_falling), cuts
 
 
 def _falling(motion: Found) -> float:
@@ -330,7 +232,7 @@ def _distinct(found: Sequence[Found]) -> list[Found]:
 def _upright_starts(a: Points, b: Points, up: np.ndarray) -> list[np.ndarray]:
     """Turns about the vertical that bring box a onto box b, the lowest points onto each other."""
     poses = []
-    for rotation in _starts(up)[:YAWS]:
+    for rotation in turns(up, YAWS):
         turned = a.points @ rotation.T
         (low_a, high_a), (low_b, high_b) = (np.quantile(points, [0.03, 0.97], axis=0) for points in (turned, b.points))
         step = (low_b + high_b - low_a - high_a) / 2
@@ -341,53 +243,78 @@ def _upright_starts(a: Points, b: Points, up: np.ndarray) -> list[np.ndarray]:
     return poses
 
 
-def settled(old: Gaussians, found: Sequence[Found], cuts: Sequence[Cut], depth: float, alike: float) -> Motion:
+def settled(
+    old: Gaussians, found: Sequence[Found], cuts: Sequence[Cut], up: np.ndarray, depth: float, alike: float
+) -> Motion:
     """The best of the two best motions after refinement, and whether the other explains the photos as well. alike: see
     `looks_alike`."""
-    refine = _distinct([refined(old, pose, cuts, depth, STEP, LEAST_STEP) for _, pose in found[:2]])
+    likely = [each for each in found[:2] if each[0].same > found[0][0].same - BEHIND]
+    refine = _distinct([refined(old, each, cuts, depth, STEP, LEAST_STEP) for each in likely])
     (signs, pose), others = refine[0], refine[1:]
+    axis = round_about(old, refine[0], cuts, up, depth)
+    if axis is not None:  # motions that differ by a turn about it are no others
+        own = pose[:3, :3].T @ axis
+        others = [other for other in others if (other[1][:3, :3] @ own) @ axis < np.cos(np.radians(TURNED))]
     odds = signs.same + LOOKS[0] * (alike - LOOKS[1])
-    return Motion(pose, odds, any(other.same > signs.same - CLOSE for other, _ in others))
+    return Motion(pose, odds, any(other.same > signs.same - CLOSE for other, _ in others), axis)
 
 
-def judged(old: Gaussians, pose: np.ndarray, cuts: Sequence[Cut], depth: float) -> Signs:
-    """What the photos say about the old thing, carried by `pose`."""
-    thing = carried(old, pose)
-    return signs_of([cut.with_thing(thing) for cut in cuts], [0], np.ones(1), np.array([depth]))[0]
+def round_about(old: Gaussians, motion: Found, cuts: Sequence[Cut], up: np.ndarray, depth: float) -> np.ndarray | None:
+    """The axis [3] about which a moved thing looks round, by its points and by the photos; None where there is none.
+    It is the vertical `up`, or one of the main axes of the points. Shades turn with a thing, though light does not."""
+    (signs, pose), points = motion, Points.of(old)
+    middle = pose[:3, :3] @ np.quantile(points.points, [0.02, 0.98], axis=0).mean(axis=0) + pose[:3, 3]
+    main = np.linalg.svd(points.points - points.points.mean(axis=0), full_matrices=False)[2]
+    for axis in (pose[:3, :3].T @ up, *main):
+        if looks_round(points, axis):
+            after = pose[:3, :3] @ axis
+            turned = judged(old, [_about(turn, middle) @ pose for turn in turns(after, YAWS)[1:]], cuts, depth)
+            if min(each.same for each, _ in turned) > signs.same - PRINT:
+                return np.asarray(after)
+    return None
 
 
-def refined(
-    old: Gaussians, pose: np.ndarray, cuts: Sequence[Cut], depth: float, step: float, least: float
-) -> tuple[Signs, np.ndarray]:
-    """The motion near `pose` that the photos support best: steps along and about three axes, halved when none helps."""
+def _about(rotation: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    """[4, 4] of a rotation [3, 3] about a point [3]."""
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = rotation, middle - rotation @ middle
+    return motion
+
+
+def judged(old: Gaussians, motions: Sequence[np.ndarray], cuts: Sequence[Cut], depth: float) -> list[Found]:
+    """What the photos say about the old thing after each of the motions."""
+    sums = np.sum([cut.sums(old, np.stack(motions), depth) for cut in cuts], axis=0)
+    return [(signs_from(row, 1.0), motion) for row, motion in zip(sums, motions, strict=True)]
+
+
+def refined(old: Gaussians, start: Found, cuts: Sequence[Cut], depth: float, step: float, least: float) -> Found:
+    """The motion near `start` that the photos support best. In each round a parabola through three values of each of
+    six steps, along and about three axes, gives the next motion; steps become shorter where that is near, or no better.
+    """
     from scipy.spatial.transform import Rotation
 
     points = Points.of(old)
     middle, radius = points.points.mean(axis=0), points.radius
-    best = judged(old, pose, cuts, depth)
+    best = judged(old, [start[1]], cuts, depth)[0]
+
+    def stepped(change: np.ndarray) -> np.ndarray:
+        pose = best[1]
+        moved = _about(Rotation.from_rotvec(change[3:]).as_matrix(), pose[:3, :3] @ middle + pose[:3, 3]) @ pose
+        moved[:3, 3] += radius * change[:3]
+        return moved
+
     while step >= least:
-        better = False
-        for axis, sign in ((axis, sign) for axis in range(6) for sign in (1, -1)):
-            change = np.zeros(6)
-            change[axis] = sign * step
-            moved = np.eye(4)
-            moved[:3, :3] = Rotation.from_rotvec(change[3:]).as_matrix() @ pose[:3, :3]
-            moved[:3, 3] = pose[:3, :3] @ middle + pose[:3, 3] + radius * change[:3] - moved[:3, :3] @ middle
-            signs = judged(old, moved, cuts, depth)
-            if signs.same > best.same + GAINS:
-                best, pose, better = signs, moved, True
-        step = step if better else step / 2
-    return best, pose
-
-
-def looks_alike(old: Gaussians, new: Gaussians) -> float:
-    """Share in [0, 1] that the histograms of the colours of two things have in common."""
-    histograms = []
-    for each in (old, new):
-        colors = Points.of(each).colors
-        counts = np.histogramdd(colors, bins=BINS, range=[(0, 1)] * 3)[0]
-        histograms.append(counts / max(counts.sum(), 1))
-    return float(np.minimum(*histograms).sum())
+        single = judged(old, [stepped(sign * step * axis) for sign in (1, -1) for axis in np.eye(6)], cuts, depth)
+        more, less = np.array([signs.same for signs, _ in single]).reshape(2, 6)
+        bend = 2 * best[0].same - more - less
+        peak = np.where(bend > 1e-6, (more - less) / np.maximum(2 * bend, 1e-6), np.sign(more - less)).clip(-1, 1)
+        found = min([*judged(old, [stepped(step * peak)], cuts, depth), *single], key=_falling)
+        gain = found[0].same - best[0].same
+        if gain > 0:
+            best = found
+        if gain < GAINS or np.abs(peak).max() < 0.5:
+            step /= SHORTER
+    return best
 
 
 def assigned(odds: np.ndarray, least: float = 0.0) -> list[tuple[int, int]]:

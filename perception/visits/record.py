@@ -75,6 +75,8 @@ def recorded(entry: dict[str, Any], visit: int, signs: Signs, motion: Motion | N
     stood["transform"] = None if motion is None else motion.new_from_old.tolist()
     if motion is not None and motion.ambiguous:
         stood["ambiguous"] = True
+    if motion is not None and motion.axis is not None:
+        stood["axis"] = motion.axis.tolist()
     past, sure = [*entry.get("past", ()), stood], 1 - probability(signs.log_odds)
     if motion is None:
         entry = {key: value for key, value in entry.items() if key != "parts"}

@@ -16,6 +16,7 @@ from perception.inputs.readers import reader_of
 from perception.inputs.transforms import in_map_frame
 from perception.localise.localiser import Localised, Localiser
 from perception.localise.photos import new_photos
+from perception.localise.report import rendered_notice
 from perception.map.files import read_info
 from perception.map.map import Map
 from perception.photos.folder import VIDEO_SUFFIXES
@@ -79,7 +80,10 @@ def visit_scene(run: Run, gmap: Map, output: Path) -> Scene:
 
 def _localised(run: Run, gmap: Map, source: Path, camera: Path | None) -> Scene:
     found = new_photos([source], camera, run.work / "sfm", run.progress)
-    answers = Localiser(gmap, progress=run.progress).answers(found)
+    localiser = Localiser(gmap, progress=run.progress)
+    if localiser.rendered:
+        run.progress.log(rendered_notice(gmap, localiser.rendered))
+    answers = localiser.answers(found)
     here = [answer for answer in answers if isinstance(answer, Localised)]
     if len(here) < LEAST_SHARE * len(answers):
         lost = next(answer for answer in answers if not isinstance(answer, Localised))

@@ -29,15 +29,15 @@ from perception.visits.motion import (
     CERTAIN,
     CLOSE,
     HOPELESS,
+    LOOKS,
     MOVED,
     TWINS,
     Motion,
     assigned,
-    carried,
-    looks_alike,
     motions_of,
     settled,
 )
+from perception.visits.registration import carried, looks_alike
 from perception.visits.visit import Visit, gaussians_of
 
 UP = (0.0, 0.0, 1.0)
@@ -47,6 +47,9 @@ INSTEAD = 0.3
 FRAGMENT = 0.3, 3
 """A new group of a score below, and of less than this many times the least Gaussians of a group, is a piece of what
 stands beside it, no thing; most things score .8 and more."""
+
+OUTLINED = 0.5
+"""Least IoU of a new thing with masks of the photos; things have .7 to .9."""
 
 
 @dataclass
@@ -83,8 +86,10 @@ def seen_today(visit: Visit) -> Today:
     new = new_surface(looks, held, run.config.train.budget or len(visit.gaussians), run.config.seed)
     progress.log(f"{len(gone)} things do not stand where they stood; {len(new)} points of new surface")
     config = update_config(run.config, len(visit.photos.views), GROWING, len(held) + SPARE * len(new))
-    together = Gaussians.concatenate([held, new])
-    grown, record = trained(run, "grow", visit.mark, visit.masks["identity"], together, len(held), visit.photos, config)
+    grown, record = held, TrainRecord()
+    if len(new):
+        both, mark = Gaussians.concatenate([held, new]), visit.masks["identity"]
+        grown, record = trained(run, "grow", visit.mark, mark, both, len(held), visit.photos, config)
 
     with run.stage("instances"):
         rows = np.arange(len(held), len(grown))
@@ -99,10 +104,18 @@ def seen_today(visit: Visit) -> Today:
         made = _without_fragments(grouped(grown, votes, free, run.config), run.config.instances.min_cluster_size)
     things = [(free[made.ids == n], float(made.scores[n])) for n in range(made.count) if (made.ids == n).any()]
     with run.stage("evidence"):
-        old = _shown_before(visit, before, grown, things, gone)
+        old, ground = _shown_before(visit, before, grown, things, gone)
+        made = replace(made, ids=np.where(np.isin(free, _rows(things, ground)), -1, made.ids))
+        stands = [j for j in range(len(things)) if j not in ground]
+        things, old = [things[j] for j in stands], {n for n, j in enumerate(stands) if j in old}
     with run.stage("motion"):
         pairs = _moved(visit, grown, things, gone)
     return _settled(visit, grown, kept, ids, made, free, signs, gone, things, old, pairs, record)
+
+
+def _rows(things: list[tuple[np.ndarray, float]], numbers: set[int]) -> np.ndarray:
+    """The rows of the things with these numbers."""
+    return np.concatenate([np.zeros(0, np.int64), *(things[j][0] for j in sorted(numbers))])
 
 
 def _without_fragments(made: Grouping, least: int) -> Grouping:
@@ -122,9 +135,10 @@ def _signs(visit: Visit, looks: list[Look]) -> list[Signs]:
 
 def _shown_before(
     visit: Visit, before: list[Look], grown: Gaussians, things: list[tuple[np.ndarray, float]], gone: list[int]
-) -> set[int]:
+) -> tuple[set[int], set[int]]:
     """Numbers of the things that the old map shows as the photos do, `before`: it only did not know them as things.
-    A thing in front of one that is `gone`, or in its place, is none of these."""
+    A thing in front of one that is `gone`, or in its place, is none of these. Numbers of those that have the outline of
+    no mask: they are ground that was hidden until now."""
     ids = np.full(len(grown), -1, np.int32)
     for j, (rows, _) in enumerate(things):
         ids[rows] = j
@@ -136,7 +150,8 @@ def _shown_before(
     anywhere = np.full(len(things), np.inf)  # what is in front of the old surface counts, too
     signs = signs_of(looks, range(len(things)), np.ones(len(things)), anywhere)
     fresh = instead > INSTEAD * pixels
-    return {j for j, each in enumerate(signs) if each.photos and each.log_odds > 0 and not fresh[j]}
+    known = {j for j, each in enumerate(signs) if each.photos and each.log_odds > 0 and not fresh[j]}
+    return known, {j for j, each in enumerate(signs) if each.outline < OUTLINED}
 
 
 def _moved(
@@ -149,6 +164,7 @@ def _moved(
     depth = {entry["id"]: min(entry["obb"]["extent"]) for entry in visit.gmap.instances}
     gravity = visit.gmap.info.get("gravity")
     up = np.array(UP) if gravity is None else -np.array(gravity["direction"], np.float64)
+    frames = visit.frames
     odds, motions = np.full((len(gone), len(things)), -np.inf), dict[tuple[int, int], Motion]()
     for j, (own, _) in enumerate(things):
         new = grown.rows(torch.from_numpy(own))
@@ -158,10 +174,10 @@ def _moved(
         for a in likely:
             if odds[:, j].max() > CERTAIN and alike[a] < alike[likely[0]] - TWINS:
                 break
-            found, cuts = motions_of(olds[gone[a]], new, visit.frames, rest, up, depth[gone[a]])
-            if not found or found[0][0].same < HOPELESS:
+            found, cuts = motions_of(olds[gone[a]], new, frames, rest, up, depth[gone[a]])
+            if not found or found[0][0].same + LOOKS[0] * (alike[a] - LOOKS[1]) < HOPELESS:
                 continue
-            motion = settled(olds[gone[a]], found, cuts, depth[gone[a]], alike[a])
+            motion = settled(olds[gone[a]], found, cuts, up, depth[gone[a]], alike[a])
             odds[a, j], motions[a, j] = motion.odds, motion
         visit.run.progress.update("motions", j + 1, len(things))
     pairs = {}
@@ -199,8 +215,7 @@ def _settled(
         if j not in taken:
             ids[rows], added[following] = following, (score, j in old)
             following += 1
-    replaced = np.concatenate([np.zeros(0, np.int64), *(things[j][0] for j in taken)])
-    stays = np.setdiff1d(np.arange(len(grown)), replaced)
+    stays = np.setdiff1d(np.arange(len(grown)), _rows(things, taken))
     pieces, names, members, owned = (
         [grown.rows(torch.from_numpy(stays))],
         [ids[stays]],

@@ -78,6 +78,16 @@ def test_tools_of_language_models_say_it_too(engine: QueryEngine) -> None:
 
     changed = ask("what_changed", since=0)
     assert {c["instance_id"]: c["state"] for c in changed["changes"]}[number("lamp")] == "moved"
+    turned = {"name": "arm", "from_map": [[0, -2, 0, 1], [2, 0, 0, 0], [0, 0, 2, 0.5], [0, 0, 0, 1]]}
+    lamp, there = (
+        next(c for c in told["changes"] if c["instance_id"] == number("lamp"))
+        for told in (changed, ask("what_changed", since=0, frame=turned))
+    )
+    for key in ("old_centroid", "new_centroid"):
+        x, y, z = lamp[key]
+        assert there[key] == pytest.approx([1 - 2 * y, 2 * x, 2 * z + 0.5])
+    after = np.array(there["transform"]) @ [*there["old_centroid"], 1]
+    assert after[:3] == pytest.approx(there["new_centroid"], abs=1e-3)
     found = ask("find", text="mug")
     assert found["hits"] == [] and [hit["instance_id"] for hit in found["gone"]] == [number("mug")]
     assert ask("find", text="lamp")["hits"][0]["state"] == "moved"

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from perception.gaussians.model import Gaussians, isotropic
 from perception.gaussians.views import render
 from perception.instances.group import Grouping
-from perception.visits.motion import Points, angle_between, assigned, carried, register
+from perception.visits.motion import assigned
+from perception.visits.registration import Points, angle_between, carried, register
 from perception.visits.today import _without_fragments
 from support.aimed import look_at
 

@@ -89,13 +89,15 @@ def scores(changes: list[dict[str, Any]], first: Map, second: Map, truth: Truth)
     said = {change["instance_id"]: change for change in changes if change["state"] != "added"}
     added = {change["instance_id"] for change in changes if change["state"] == "added"}
     right, wrong, true = (dict.fromkeys(STATES, 0) for _ in range(3))
-    alarms, lost, errors, kept, unchanged, unseen = 0, 0, [], [], 0, 0
+    alarms, lost, errors, kept, unchanged, unseen, blind = 0, 0, [], [], 0, 0, 0
+    came, errant = [], []  # confidence and truth of what was told; what is wrong, in words
     for thing in truth.entries:
         state, allowed = truth.right(thing)
         if state == "added":
             if truth.entries[thing]["seen_in_visit2"] >= UNSEEN and (truth.ids[1] == thing).any():
                 true["added"] += 1
                 right["added"] += after.get(thing) in added
+                errant += [] if after.get(thing) in added else [f"{truth.entries[thing]['name']}: added, not said"]
             continue
         if not (truth.ids[0] == thing).any():
             continue
@@ -103,6 +105,10 @@ def scores(changes: list[dict[str, Any]], first: Map, second: Map, truth: Truth)
         new_alarm = after.get(thing) in added
         wrong["added"] += new_alarm
         true[state] += not (told["state"] in allowed and told["state"] != state)
+        if told["state"] not in allowed or new_alarm:
+            errant.append(f"{truth.entries[thing]['name']}: {state}, said {told['state']}{', added' * new_alarm}")
+        if told["state"] not in (None, "unseen") and told.get("confidence") is not None:
+            came.append((told["confidence"], float(told["state"] in allowed)))
         if told["state"] == state:
             right[state] += 1
         elif told["state"] is not None and told["state"] not in allowed:
@@ -115,9 +121,9 @@ def scores(changes: list[dict[str, Any]], first: Map, second: Map, truth: Truth)
             unseen += 1
             lost += told["state"] == "removed"
         if told["state"] == "moved" and told.get("transform") and truth.entries[thing]["transform"]:
-            errors.append(
-                _error(np.array(told["transform"]), np.array(truth.entries[thing]["transform"]), thing, truth)
-            )
+            error = _error(np.array(told["transform"]), np.array(truth.entries[thing]["transform"]), thing, truth)
+            blind += told.get("axis") is not None
+            errors.append((*error[:2], np.nan if told.get("axis") is not None else error[2]))
     for change in changes:  # of instances that are no thing: those on stuff do not count
         new, instance = change["state"] == "added", change["instance_id"]
         if instance not in (after if new else before).values():
@@ -133,21 +139,34 @@ def scores(changes: list[dict[str, Any]], first: Map, second: Map, truth: Truth)
         }
         for state in STATES
     }
-    median = np.median(errors, axis=0).tolist() if errors else [None, None]
+    known = [table[state]["f1"] for state in CHANGED if table[state]["true"]]
+    median = [_median(column) for column in np.array(errors).reshape(-1, 3).T]
     return {
         "states": table,
-        "f1": float(np.mean([table[state]["f1"] for state in CHANGED if table[state]["true"]] or [0])),
+        "f1": float(np.mean(known)) if known else None,
         "false_alarms": alarms / max(1, unchanged), "unseen_called_removed": lost / max(1, unseen),
-        "motion_cm": median[0], "motion_degrees": median[1], "ids_kept": float(np.mean(kept)) if kept else None,
+        "motion_cm": median[0], "nearest_cm": median[1], "motion_degrees": median[2], "turns_unknown": blind,
+        "ids_kept": float(np.mean(kept)) if kept else None, "told": came, "wrong": errant,
     }  # fmt: skip
 
 
-def _error(found: np.ndarray, true: np.ndarray, thing: int, truth: Truth) -> tuple[float, float]:
-    """Centimetres at the thing's centre, and degrees."""
-    centre = truth.points[0][truth.ids[0] == thing].mean(axis=0)
+def _median(values: np.ndarray) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else None
+
+
+def _error(found: np.ndarray, true: np.ndarray, thing: int, truth: Truth) -> tuple[float, float, float]:
+    """Centimetres at the thing's centre; from its points to the nearest ones as they truly lie, in the mean, which
+    is blind to turns that change nothing; degrees."""
+    from scipy.spatial import cKDTree
+
+    points = truth.points[0][truth.ids[0] == thing]
+    centre = points.mean(axis=0)
+    placed, right = (points @ motion[:3, :3].T + motion[:3, 3] for motion in (found, true))
+    nearest = float(cKDTree(right).query(placed)[0].mean())
     shift = (found - true)[:3, :3] @ centre + (found - true)[:3, 3]
     cosine = (np.trace(found[:3, :3] @ true[:3, :3].T) - 1) / 2
-    return 100 * float(np.linalg.norm(shift)), float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+    return 100 * float(np.linalg.norm(shift)), 100 * nearest, float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
 def naive(first: Map, second: Map) -> list[dict[str, Any]]:
@@ -174,11 +193,12 @@ def naive(first: Map, second: Map) -> list[dict[str, Any]]:
 
 
 def show(name: str, result: dict[str, Any]) -> None:
-    print(f"{name}: mean F1 of moved, removed and added {result['f1']:.3f}")
+    print(f"{name}: mean F1 of moved, removed and added {result['f1'] or float('nan'):.3f}")
     for state, row in result["states"].items():
         print(f"  {state:10s} P {row['precision']:.2f}  R {row['recall']:.2f}  F1 {row['f1']:.2f}  of {row['true']}")
-    rest = {key: value for key, value in result.items() if key not in ("states", "f1")}
+    rest = {key: value for key, value in result.items() if key not in ("states", "f1", "told", "wrong")}
     print("  " + ", ".join(f"{key} {value:.3f}" if value is not None else f"{key} –" for key, value in rest.items()))
+    print("  wrong: " + "; ".join(result["wrong"]))
 
 
 def main() -> None:

@@ -1,0 +1,60 @@
+"""What an update refuses before it changes anything: older photos, and depth in another unit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from perception.errors import InputError
+from perception.gaussians.views import TrainingView
+from perception.visits.look import Look
+from perception.visits.scene import foreign_photos, refuse_older
+
+TAKEN = 0x9003  # EXIF DateTimeOriginal
+
+
+def photo(path: Path, time: str | None) -> SimpleNamespace:
+    """A view of visit 0, of a photo that was taken at a time by EXIF."""
+    exif = Image.Exif()
+    if time is not None:
+        exif.get_ifd(0x8769)[TAKEN] = time
+    Image.new("RGB", (8, 8)).save(path, exif=exif)
+    return SimpleNamespace(photo=path, visit=0)
+
+
+def a_map(views: list[SimpleNamespace]) -> Any:
+    return SimpleNamespace(views=views, located_views=lambda: views, path=Path("home.gsmap"))
+
+
+def test_photos_older_than_the_map_are_refused_by_their_exif(tmp_path: Path) -> None:
+    old = [photo(tmp_path / "a.jpg", "2026:11:24 10:00:00"), photo(tmp_path / "b.jpg", "2026:11:24 10:05:00")]
+    before: Any = [photo(tmp_path / "c.jpg", "2026:11:23 09:00:00")]
+    later: Any = [photo(tmp_path / "d.jpg", "2026:11:25 09:00:00")]
+    unknown: Any = [photo(tmp_path / "e.jpg", None)]
+    with pytest.raises(InputError, match="older than the map") as refused:
+        refuse_older(a_map(old), before)
+    assert str(tmp_path) in str(refused.value) and "2026-11-24 10:05" in str(refused.value)
+    refuse_older(a_map(old), later)
+    refuse_older(a_map(old), unknown)
+    refuse_older(a_map(unknown), before)
+
+
+def test_depth_in_another_unit_is_refused(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    variance = rng.uniform(0.01, 0.02, (20, 30))
+    black = torch.zeros(20, 30, 3, dtype=torch.uint8)
+
+    def look(unit: float) -> Look:
+        view = TrainingView("a", black, None, torch.eye(3), torch.eye(4), depth=torch.full((20, 30), 2.0 * unit))
+        none = np.full((20, 30), -1)
+        return Look(view, np.full((20, 30), 2.0), np.zeros((20, 30)), none, variance, variance, variance, variance)
+
+    assert foreign_photos(tmp_path, a_map([]), [look(1.0)]) == []
+    with pytest.raises(InputError, match="another unit: its depth images measure 1e"):
+        foreign_photos(tmp_path, a_map([]), [look(1000.0)])
