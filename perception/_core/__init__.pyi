@@ -1,7 +1,7 @@
 """Compiled kernels of perception."""
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, overload
 
 import numpy
 from numpy.typing import NDArray
@@ -109,3 +109,10 @@ def plane_sweep(photo: Annotated[NDArray[numpy.uint8], dict(shape=(None, None), 
     Fills depth [h, w] of photo [h, w] from others and a prior depth (0 = none). Plane i has the inverse depth
     first + step * i. homographies: A, B per other; A + B / z maps pixels, whose centres are integers.
     """
+
+@overload
+def normal_cdf(x: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], out: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')]) -> None: ...
+
+@overload
+def normal_cdf(x: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu', writable=False)], out: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu')]) -> None:
+    """Fills out [N] with Phi(x) of x [N]."""

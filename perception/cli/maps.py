@@ -170,11 +170,7 @@ def _upgrade(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.export.export_map import ExportOptions, export_map, side_file
-    from perception.export.mesh import check_outputs, export_mesh, export_voxels
     from perception.map.outputs import check_side_file, refuse_inputs
-    from perception.map.write import read_map
-    from perception.query import load_map
-    from perception.query.scene_graph import write_graph
 
     if args.output is None and args.mesh is None and args.voxels is None and args.graph is None:
         raise InputError("export: nothing to write; give -o OUT, --mesh OUT, --voxels OUT.npz or --graph OUT.json")
@@ -182,7 +178,10 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         raise InputError("export: --points labels a cloud; give the file to write it to with -o")
     if args.instance is not None and args.mesh is None:
         raise InputError("export: --instance selects what --mesh writes; give --mesh OUT")
-    check_outputs(args.mesh, args.voxels, args.voxel_size)
+    if (args.mesh, args.voxels, args.voxel_size) != (None, None, None):
+        from perception.export.mesh import check_outputs
+
+        check_outputs(args.mesh, args.voxels, args.voxel_size)
     side = None if args.output is None else side_file(args.output)
     inputs = [args.map, args.points, args.transform, args.segments]
     refuse_inputs([args.output, side, args.mesh, args.voxels, args.graph], inputs)
@@ -191,9 +190,15 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     facts: dict[str, Any] = {}
     lines = []
     if args.graph is not None:
+        from perception.query import load_map
+        from perception.query.scene_graph import write_graph
+
         facts["graph"], text = write_graph(load_map(args.map), args.graph)
         lines.append(text)
     if args.mesh is not None or args.voxels is not None:
+        from perception.export.mesh import export_mesh, export_voxels
+        from perception.map.write import read_map
+
         gmap = read_map(args.map)
         if args.mesh is not None:
             facts["mesh"], text = export_mesh(gmap, args.mesh, args.instance, args.voxel_size, args.color)

@@ -9,25 +9,24 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from perception.colors import instance_palette, rgb8_from_sh
 from perception.errors import InputError
-from perception.export.align import align
-from perception.export.depth_views import DepthView, depth_views
 from perception.export.neighbors import nearest_gaussian
-from perception.export.render import map_views
 from perception.export.smooth import read_segments, segment_cloud, vote
 from perception.export.spz import write_spz
 from perception.frame.recentre import map_from_input
-from perception.gaussians.model import as_gaussians
 from perception.geometry import check_similarity, move_points, scale_of
 from perception.io.atomic import atomic_file
 from perception.io.cloud import read_cloud, storable, write_cloud
 from perception.map.write import Map, read_map
 from perception.types import PointCloud
+
+if TYPE_CHECKING:
+    from perception.export.depth_views import DepthView
 
 MOST_VIEWS, LONG_SIDE = 90, 320
 """Views rendered for a registration, and their size in pixels."""
@@ -55,6 +54,10 @@ class ExportOptions:
 
 def rendered_depth(gmap: Map, most: int, long_side: int) -> list[DepthView]:
     """Depth from up to `most` of the map's views, evenly chosen, in the map's frame; InputError without views."""
+    from perception.export.depth_views import depth_views
+    from perception.export.render import map_views
+    from perception.gaussians.model import as_gaussians
+
     views = map_views(gmap, held_out=False)
     if not views:
         raise InputError(f"{gmap.path}: holds no views, and depth is rendered from those; map again from photos")
@@ -66,6 +69,8 @@ def aligned(gmap: Map, scan: PointCloud, name: str) -> tuple[np.ndarray, dict[st
 
     With a scale where the map's unit is not known to be the metre.
     """
+    from perception.export.align import align
+
     found = align(rendered_depth(gmap, MOST_VIEWS, LONG_SIDE), scan, similar=not gmap.metric)
     if found.refusal is not None:
         raise InputError(f"{name}: cannot be aligned with the map: {found.refusal}; give --transform FILE")

@@ -10,6 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
+from perception import _core
 from perception.errors import InputError, missing_extra
 
 
@@ -97,6 +98,14 @@ def check_images(images: Sequence[np.ndarray]) -> None:
             raise InputError(
                 f"picture {n + 1}: expected RGB uint8 [H, W, 3], found {image.dtype} of shape {list(image.shape)}"
             )
+
+
+def normal_cdf(x: np.ndarray) -> np.ndarray:
+    """Φ of each number, the cumulative function of the normal distribution, as float32 or float64 of x's shape."""
+    x = np.asarray(x, order="C")
+    out = np.empty_like(x)
+    _core.normal_cdf(x.reshape(-1), out.reshape(-1))
+    return out
 
 
 AT_ONCE = 4096

@@ -19,6 +19,13 @@ PALETTE = 24  # colours kept per instance
 BIN = 8.0  # CIELAB units per histogram cell
 SIGMA = 15.0  # CIELAB distance at which a colour counts 60 %
 LIGHTNESS = 0.6  # weight of a lightness difference relative to one of hue or chroma
+# sRGB (IEC 61966-2-1) and CIE 1931 with D65, as scikit-image has them.
+_LINEAR = np.arange(256) / 255
+_LINEAR = np.where(_LINEAR > 0.04045, ((_LINEAR + 0.055) / 1.055) ** 2.4, _LINEAR / 12.92)
+_XYZ_FROM_RGB = np.array(
+    [[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]]
+)
+_WHITE = np.array([0.95047, 1.0, 1.08883])
 
 # Examples of the English colour words, sRGB 0–255. Words with a wide range have several.
 _EXAMPLES: dict[str, tuple[tuple[int, int, int], ...]] = {
@@ -103,10 +110,11 @@ def palette(pixels: np.ndarray) -> np.ndarray:
 
 
 def lab_of(pixels: np.ndarray) -> np.ndarray:
-    """sRGB [P, 3] uint8 → CIELAB (D65) [P, 3] float64."""
-    from skimage.color import rgb2lab
-
-    return np.asarray(rgb2lab(np.asarray(pixels, np.uint8)))
+    """sRGB [P, 3] uint8 → CIELAB (D65) [P, 3] float64. scikit-image has it too, but takes longer to import than a
+    prompt to answer."""
+    xyz = _LINEAR[np.asarray(pixels, np.uint8)] @ _XYZ_FROM_RGB.T / _WHITE
+    x, y, z = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116).T
+    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=1)
 
 
 def color_share(palettes: np.ndarray, word: str) -> np.ndarray:

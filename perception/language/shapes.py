@@ -175,14 +175,16 @@ def boxiness(points: np.ndarray) -> float:
     Uses the upright bounding box with the smallest ground area, of rotations in steps of 5°. With its sides S:
     ramp(mean distance to the nearest face / √(min S · median S); BOX_FACES) · ramp(share near upright edges; BOX_EDGES)
     """
-    best = np.inf
-    for angle in np.radians(np.arange(0, 90, 5)):
-        c, s = np.cos(angle), np.sin(angle)
-        turned = points @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
-        low, high = np.percentile(turned, [2, 98], axis=0)
-        sides = np.maximum(high - low, 1e-9)
-        if sides[0] * sides[1] < best:
-            best, size, inside = sides[0] * sides[1], sides, np.minimum(turned - low, high - turned)
+    angles = np.radians(np.arange(0, 90, 5))
+    turns = np.tile(np.eye(3), (len(angles), 1, 1))
+    turns[:, 0, 0] = turns[:, 1, 1] = np.cos(angles)
+    turns[:, 1, 0] = np.sin(angles)
+    turns[:, 0, 1] = -turns[:, 1, 0]
+    turned = points @ turns  # [A, P, 3]
+    low, high = np.percentile(turned, [2, 98], axis=1)
+    sides = np.maximum(high - low, 1e-9)
+    best = int((sides[:, 0] * sides[:, 1]).argmin())
+    size, inside = sides[best], np.minimum(turned[best] - low[best], high[best] - turned[best])
     # inside: distance to the nearer of the two faces along each axis
     nearest = np.abs(inside / np.sqrt(size.min() * np.median(size))).min(axis=1)
     at_edges = np.abs(inside[:, :2] / size[:2]).max(axis=1) < NEAR_EDGE

@@ -35,13 +35,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from statistics import NormalDist
 from typing import TypeVar
 
 import numpy as np
-from scipy.special import ndtr, ndtri
 
 from perception.errors import InputError
-from perception.language.base import Encoder, Part, check_texts, reading_of, unit_rows
+from perception.language.base import Encoder, Part, check_texts, normal_cdf, reading_of, unit_rows
 from perception.language.colors import COLOR_WORDS, color_share, color_words, match_of_shares, without_color_words
 from perception.language.description import InstanceDescription
 from perception.language.household import household_thing, size_misfits
@@ -49,9 +49,7 @@ from perception.language.printed import Printed, quoted_text
 from perception.language.shape_words import HINTS, KINDS, STUFF, shape_kind
 
 PRESENT = 0.8  # default minimum score of an answer; the probes are harder than typical absent objects
-LAPSE = (
-    0.02  # share of prompts that mislead whatever z is: of 275 whose best hit had z > 2, 4 named nothing that was there
-)
+LAPSE = 0.02  # share of prompts that mislead however large z is: 4 of 275 whose best hit had z > 2 were absent
 BESIDE = 0.6  # largest difference in Φ⁻¹(score) to the best hit, of another one that answers the prompt too
 QUANTILE, NORMAL_QUANTILE = 0.8, 0.8416  # Φ(.8416) = .8
 BETA = 0.5  # fraction of the map's mean embedding that is subtracted
@@ -68,6 +66,8 @@ LABEL_MARGIN = 2.0  # subtracted from z of a label, where z is the similarity of
 LEAST_SPREAD = 1e-3  # of σ_tk, so that no text divides by zero
 
 T = TypeVar("T")
+_quantiles = np.vectorize(NormalDist().inv_cdf, otypes=[float])
+"""Φ⁻¹ of each number. SciPy has it too, but takes longer to import than a prompt to answer."""
 
 
 @dataclass(frozen=True)
@@ -88,12 +88,12 @@ def answering(hits: Sequence[tuple[T, float]], min_score: float | None = None) -
 
 def least_score(best: np.ndarray) -> np.ndarray:
     """The least score of an answer, given the best score of each map."""
-    return np.maximum(PRESENT, (1 - LAPSE) * ndtr(evidence_of(best) - BESIDE))
+    return np.maximum(PRESENT, (1 - LAPSE) * normal_cdf(evidence_of(best) - BESIDE))
 
 
 def evidence_of(score: np.ndarray) -> np.ndarray:
     """a z + b of scores, at most 6, also for labels that equal the prompt."""
-    return np.asarray(ndtri(np.clip(np.asarray(score) / (1 - LAPSE), 1e-9, 1 - 1e-9)))
+    return _quantiles(np.clip(np.asarray(score) / (1 - LAPSE), 1e-9, 1 - 1e-9))
 
 
 @dataclass(frozen=True)
@@ -246,7 +246,7 @@ class Scorer:
             shares = [known.colors[:, COLOR_WORDS.index(word)] for word in colors]
             z = z + COLOR_WEIGHT * (match_of_shares(shares) - 0.5)
         a, b = reading.calibration
-        scores = (1 - LAPSE) * ndtr(a * z + b) * np.minimum(1.0, QUOTED_LEAST + borne)
+        scores = (1 - LAPSE) * normal_cdf(a * z + b) * np.minimum(1.0, QUOTED_LEAST + borne)
         if len(self.encoder.canonical):
             scores = np.minimum(scores, 2 * PRESENT * self._against_canonical(row))
         scores[~self.seen] = 0.0
@@ -280,7 +280,8 @@ class Scorer:
         middle, spread = self.prepared.label_null.T
         fits = self.prepared.label_rows @ self.encoder.embed([text])[0]
         z = ((fits - middle) / spread).astype(np.float64)
-        same, alike = np.array([name == _normal(text) for name in self._names]), (1 - LAPSE) * ndtr(z - LABEL_MARGIN)
+        same = np.array([name == _normal(text) for name in self._names])
+        alike = (1 - LAPSE) * normal_cdf(z - LABEL_MARGIN)
         scores[self._named] = np.where(same, 1.0, np.maximum(scores[self._named], alike))
         return scores
 

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from perception.map.checksums import IGNORED
 from perception.map.history import STATES, Visit, changes_of, date_of, is_removed, visits_of
-from perception.query import Hit, QueryMap
-from perception.query.hit import printed_texts
+from perception.query.hit import Hit, printed_texts
+
+if TYPE_CHECKING:
+    from perception.query import QueryMap
 
 
 def map_facts(path: Path | str, info: dict[str, Any]) -> dict[str, Any]:
@@ -248,6 +249,8 @@ def _change_row(
     if change.get("axis") is not None:
         parts.append("looks round, so its turn is not known")
     elif change["transform"] is not None:
+        from scipy.spatial.transform import Rotation
+
         rotation = Rotation.from_matrix(np.array(change["transform"])[:3, :3])
         parts.append(f"turned {np.degrees(rotation.magnitude()):.0f}°")
     if change["state"] == "removed":

@@ -64,6 +64,16 @@ def test_sentences_equal_transformers() -> None:
     assert np.abs(MiniLM().encode(TEXTS) - expected).max() < 1e-5
 
 
+def test_damaged_weights_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    weights = packaged_file(*WEIGHTS)
+    (tmp_path / "config.json").write_bytes((weights.parent / "config.json").read_bytes())
+    monkeypatch.setattr("perception.language.minilm.packaged_file", lambda *_: tmp_path / weights.name)
+    for damaged in (b"", weights.read_bytes()[:5000], weights.read_bytes()[:200_000], b"\xff" * 5000):
+        (tmp_path / weights.name).write_bytes(damaged)
+        with pytest.raises(InputError, match="its weights are damaged"):
+            MiniLM()
+
+
 def test_classifier_equals_the_published_module(encoder: Any) -> None:
     """Our plain module and the frozen one against efficientnet-lite-pytorch with the same weights."""
     published = pytest.importorskip("efficientnet_lite_pytorch")

@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.special import ndtr, ndtri
 from scipy.stats import norm
+from skimage.color import rgb2lab
 
 from perception.errors import InputError
-from perception.language.base import Part, Reading
+from perception.language.base import Part, Reading, normal_cdf
 from perception.language.colors import (
     color_share,
     color_words,
@@ -29,7 +31,7 @@ from perception.language.description import (
     unseen,
 )
 from perception.language.shape_words import KINDS
-from perception.query.ranking import LAPSE, PRESENT, Answer, Ranker, answering, probes
+from perception.query.ranking import BESIDE, LAPSE, PRESENT, Answer, Ranker, answering, least_score, probes
 
 DIM = 24
 
@@ -170,6 +172,21 @@ def test_lab_of_known_colors() -> None:
         [32.30, 79.19, -107.86],
     ]
     assert np.allclose(lab_of(rgb), expected, atol=0.02)
+
+
+def test_lab_equals_scikit_image() -> None:
+    rgb = np.concatenate([np.random.default_rng(0).integers(0, 256, (2000, 3)), np.tile(np.arange(256)[:, None], 3)])
+    assert np.allclose(lab_of(rgb), rgb2lab(rgb.astype(np.uint8)), atol=1e-10)
+
+
+def test_normal_distribution_equals_scipy() -> None:
+    z = np.linspace(-9, 9, 5001)
+    assert np.allclose(normal_cdf(z), ndtr(z), rtol=1e-13, atol=0)
+    assert np.allclose(normal_cdf(z.astype(np.float32)), ndtr(z.astype(np.float32)), rtol=1e-5, atol=0)
+    best = np.linspace(0, 1, 1001)
+    evidence = ndtri(np.clip(best / (1 - LAPSE), 1e-9, 1 - 1e-9))
+    expected = np.maximum(PRESENT, (1 - LAPSE) * ndtr(evidence - BESIDE))
+    assert np.allclose(least_score(best), expected, rtol=1e-12)
 
 
 def test_palette_shares_and_means() -> None:
