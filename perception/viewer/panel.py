@@ -102,10 +102,10 @@ class Panel:
                 },
             )
 
-        def rename_it() -> None:
-            editor.rename(session.chosen(), self._name.value)
+        def rename_it(event: Any) -> None:
+            self.viewer.guarded(lambda: editor.rename(session.chosen(), self._name.value), event.client, edited=True)
 
-        form.on_submit(lambda event: self.viewer.guarded(rename_it, event.client, edited=True))
+        form.on_submit(rename_it)
 
     def _actions(self, label: str, actions: dict[str, Callable[[], object]]) -> None:
         """A row of buttons, each an edit."""
