@@ -14,7 +14,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.arrays import map_npy, read_npz
 from perception.io.atomic import current
-from perception.io.documents import DAMAGE, brief
+from perception.io.documents import brief
 from perception.io.json_shapes import parsed
 from perception.io.ply import map_ply
 from perception.map.checksums import EDITABLE, FACTS, STORE, check_file, check_sizes, damaged
@@ -85,7 +85,7 @@ class MapFiles:
             array = map_npy(file)
         except FileNotFoundError as error:
             raise damaged(file, "is missing") from error
-        except DAMAGE as error:
+        except Exception as error:  # NumPy's, of many classes
             raise damaged(file, f"cannot be read ({brief(error)})") from error
         kind = "i" if name == "instance_ids" else "f"
         if array.ndim != sides or array.dtype.kind != kind or array.dtype.itemsize > 4:

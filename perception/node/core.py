@@ -170,7 +170,7 @@ class Core:
             if len(questions) != 1:
                 raise InputError("query: one text for a name; give further texts as further names")
             question = questions[0]
-            reply = question.request.answered(gmap, time.monotonic())
+            reply = question.request.answered(gmap)
         except InputError as error:
             return self._error_value(error, name)
         if question.points:

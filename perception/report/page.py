@@ -169,8 +169,8 @@ class _Album:
             return None
 
     def visit(self, name: str) -> int:
-        """The number of the visit that took a view's photo."""
-        return int(getattr(self.views[name], "visit", 0))
+        """The number of the visit that took a view's photo; 0 for a name that is none of the map's."""
+        return int(getattr(self.views.get(name), "visit", 0))
 
     def _camera(self, name: str) -> tuple[torch.Tensor, torch.Tensor, int, int]:
         """camera_from_world [4, 4], K [3, 3], width and height of a view's photo as it was trained."""
