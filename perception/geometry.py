@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,16 @@ FAR_GAP = 20.0
 across a hall at 10."""
 
 
+def transform(linear: np.ndarray, shift: np.ndarray | Sequence[float]) -> np.ndarray:
+    """The matrix [4, 4] float64 of x ↦ linear x + shift; linear [3, 3], shift [3]."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = linear, shift
+    return matrix
+
+
 def inverse_se3(a_from_b: np.ndarray) -> np.ndarray:
     """b_from_a [4, 4] of a rigid a_from_b [4, 4]."""
-    inverse = np.eye(4)
-    inverse[:3, :3] = a_from_b[:3, :3].T
-    inverse[:3, 3] = -a_from_b[:3, :3].T @ a_from_b[:3, 3]
-    return inverse
+    return transform(a_from_b[:3, :3].T, -a_from_b[:3, :3].T @ a_from_b[:3, 3])
 
 
 def camera_centres(camera_from_world: np.ndarray) -> np.ndarray:
@@ -72,11 +77,9 @@ def interpolated_pose(times: np.ndarray, poses: np.ndarray, time: float, gap: fl
     from scipy.spatial.transform import Rotation, Slerp
 
     share = (time - times[after - 1]) / (times[after] - times[after - 1])
-    pose = np.eye(4)
     pair = Rotation.from_matrix(poses[after - 1 : after + 1, :3, :3])
-    pose[:3, :3] = Slerp([0.0, 1.0], pair)(share).as_matrix()
-    pose[:3, 3] = (1 - share) * poses[after - 1, :3, 3] + share * poses[after, :3, 3]
-    return pose
+    shift = (1 - share) * poses[after - 1, :3, 3] + share * poses[after, :3, 3]
+    return transform(Slerp([0.0, 1.0], pair)(share).as_matrix(), shift)
 
 
 def align_similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from perception.bags.read import ODOMETRY, TRANSFORMS, Bag, Recorded, stamp_of
-from perception.geometry import interpolated_pose, inverse_se3
+from perception.geometry import interpolated_pose, inverse_se3, transform
 
 FIXED_FRAMES = ("map", "odom", "world")
 MAX_GAP = 0.5
@@ -101,13 +101,10 @@ def read_poses(bag: Bag) -> Poses:
 
 def _matrix(position: Any, quaternion: Any) -> np.ndarray | None:
     """[4, 4]; None for numbers that are not finite."""
-    matrix = np.eye(4)
-    xyzw = np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w])
-    if not np.isfinite([*xyzw, position.x, position.y, position.z]).all():
+    xyzw, xyz = [quaternion.x, quaternion.y, quaternion.z, quaternion.w], [position.x, position.y, position.z]
+    if not np.isfinite([*xyzw, *xyz]).all():
         return None
-    matrix[:3, :3] = Rotation.from_quat(xyzw if np.linalg.norm(xyzw) > 0 else [0, 0, 0, 1]).as_matrix()
-    matrix[:3, 3] = position.x, position.y, position.z
-    return matrix
+    return transform(Rotation.from_quat(xyzw if any(xyzw) else [0, 0, 0, 1]).as_matrix(), xyz)
 
 
 def gravity(bag: Bag, poses: Poses, fixed: str) -> tuple[np.ndarray, float] | None:

@@ -21,6 +21,7 @@ import numpy as np
 from perception.bench.output import Column, bench_parser, finish, table
 from perception.errors import InputError
 from perception.io.arrays import read_npz
+from perception.io.documents import refusing
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -72,13 +73,11 @@ def load_scene(path: Path) -> dict[str, Any]:
     import torch
 
     expected = f"an .npz with {', '.join(SPLAT_KEYS)}, viewmat, K, width, height"
-    try:
+    with refusing(f"{path}: not a splats file ({{why}}); expected {expected}"):
         data = read_npz(path, path, f"expected {expected}")
         scene: dict[str, Any] = {k: torch.from_numpy(data[k].astype(np.float32)) for k in SPLAT_KEYS}
         scene["viewmats"], scene["Ks"] = (torch.from_numpy(data[k].astype(np.float32))[None] for k in ("viewmat", "K"))
         return {**scene, "width": int(data["width"]), "height": int(data["height"])}
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: not a splats file ({error}); expected {expected}") from None
 
 
 @dataclass(frozen=True)

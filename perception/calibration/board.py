@@ -133,14 +133,13 @@ class Board:
     def from_text(cls, text: str) -> Board:
         """The board of "KIND:COLSxROWS:SQUARE[:MARKER[:DICTIONARY]]"; the marker is 3/4 of the square by default."""
         kind, squares, square, marker, dictionary = (*text.split(":"), *[""] * 5)[:5]
+        expected = "expected KIND:COLSxROWS:SQUARE[:MARKER[:DICTIONARY]] such as charuco:8x11:0.02"
         try:
             columns, rows = (int(side) for side in squares.lower().split("x"))
             side = float(square)
             return cls(kind, (columns, rows), side, float(marker or 0.75 * side), dictionary or "5X5_100")
         except ValueError as error:
-            raise InputError(
-                f"board: found '{text}', expected KIND:COLSxROWS:SQUARE[:MARKER[:DICTIONARY]] such as charuco:8x11:0.02"
-            ) from error
+            raise InputError(f"board: found '{text}', {expected}") from error
 
     def __str__(self) -> str:
         markers = f", markers {self.dictionary}" if self.kind == "charuco" else ""

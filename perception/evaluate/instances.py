@@ -18,6 +18,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.cloud import read_cloud, to_int32
+from perception.io.documents import refusing
 from perception.types import PointCloud
 
 OBJECT = 1  # the only class in class-agnostic evaluation
@@ -317,11 +318,9 @@ def run_instances(prediction: str | Path, truth: str | Path, protocol: str = "sc
 def read_scores(path: str | Path) -> dict[int, float]:
     """Confidence by instance id from an export's sidecar, {"instances": {"<id>": {"score": s}}}."""
     path = Path(path)
-    try:
+    with refusing(f'{path}: expected {{"instances": {{"<id>": {{"score": number}}}}}} ({{why}})'):
         rows = json.loads(path.read_text(encoding="utf-8"))["instances"]
         return {int(key): float(row["score"]) for key, row in rows.items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f'{path}: expected {{"instances": {{"<id>": {{"score": number}}}}}} ({error!r})') from error
 
 
 def _ids(cloud: PointCloud, path: str | Path) -> Any:

@@ -26,7 +26,7 @@ from perception.errors import InputError
 from perception.export.align_steps import Images, Similarity, gray_images, jacobian, likely_rotations, robust_gain
 from perception.export.depth_views import DepthView, fused_surface, grid_cells, observe
 from perception.export.neighbors import Neighbors, list_normals, neighbor_lists
-from perception.geometry import sums_by
+from perception.geometry import sums_by, transform
 from perception.types import PointCloud
 
 SCALES = 2.0 ** np.arange(-2, 1.51, 1 / 9)
@@ -117,8 +117,7 @@ class Registration:
         unit = self.extent / scan_extent if similar else 1.0
         self.scales = unit * SCALES if similar else np.ones(1)
         self.tolerance = TOLERANCE * self.extent
-        shift = np.eye(4)
-        shift[:3, 3] = self.middle
+        shift = transform(np.eye(3), self.middle)
         self.views = [replace(view, camera_from_world=view.camera_from_world @ shift) for view in views]
         self.tree = Neighbors(self.points)
         colors = None if scan.colors is None else scan.colors[rows]
@@ -209,9 +208,7 @@ class Registration:
         (score, agreement, overlap, cover), best, rms, information = tried[0]
         others = (figures[0] for figures, other, *_ in tried[1:] if self.apart(other, best) > ELSEWHERE * self.extent)
         rival = max(others, default=0.0) / max(score, 1e-9)
-        matrix = np.eye(4)
-        matrix[:3, :3] = best.linear
-        matrix[:3, 3] = best.shift + self.middle - best.linear @ self.scan_middle
+        matrix = transform(best.linear, best.shift + self.middle - best.linear @ self.scan_middle)
         stiffness = float(np.linalg.eigvalsh(information)[0])
         light = self.brightness
         likeness = None if light is None else self._alike(best(self.scan[self.rows]), light[self.rows], self.views)

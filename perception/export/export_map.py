@@ -22,6 +22,7 @@ from perception.frame.recentre import map_from_input
 from perception.geometry import check_similarity, move_points, scale_of
 from perception.io.atomic import atomic_file
 from perception.io.cloud import read_cloud, storable, write_cloud
+from perception.io.documents import refusing
 from perception.map.write import Map, read_map
 from perception.types import PointCloud
 
@@ -81,7 +82,7 @@ def aligned(gmap: Map, scan: PointCloud, name: str) -> tuple[np.ndarray, dict[st
 def read_transform(path: Path) -> np.ndarray:
     """map_from_scan [4, 4] float64: four rows of four numbers as text or JSON, or a JSON object that holds them as
     `map_from_scan`, as `export` writes. InputError unless it is a rotation, a positive scale and a translation."""
-    try:
+    with refusing(f"{path}: expected a 4 × 4 matrix as text or JSON ({{why}})"):
         text = path.read_text(encoding="utf-8-sig")
         if text.lstrip()[:1] in ("[", "{"):
             rows = json.loads(text)
@@ -89,8 +90,6 @@ def read_transform(path: Path) -> np.ndarray:
         else:
             lines = (line.replace(",", " ").split() for line in text.splitlines())
             rows = [[float(number) for number in line] for line in lines if line]
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: expected a 4 × 4 matrix as text or JSON ({error})") from error
     return check_similarity(rows, str(path))
 
 

@@ -19,7 +19,7 @@ from perception.gaussians.views import depth_image, render, rgb_image
 from perception.inputs.transforms import in_map_frame, read_frames
 from perception.instances.silhouettes import render_silhouettes
 from perception.io.atomic import atomic_file
-from perception.io.documents import safe_name
+from perception.io.documents import refusing, safe_name
 from perception.map.outputs import refuse_inputs
 from perception.map.write import Map, read_map
 from perception.photos.decode import SUFFIXES
@@ -97,10 +97,8 @@ def _cameras(path: Path) -> list[View]:
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a transforms.json with the cameras to render")
     frames = read_frames(path)
-    try:
+    with refusing(f"{path}: some file_path are absolute, others relative; write all of one kind"):
         folder = os.path.commonpath([str(PurePosixPath(name).parent) for name, _, _ in frames]) if frames else ""
-    except ValueError as error:
-        raise InputError(f"{path}: some file_path are absolute, others relative; write all of one kind") from error
     short = [PurePosixPath(name).relative_to(folder).as_posix() for name, _, _ in frames]
     return [make_view(name, path, lens, pose, path) for name, (_, pose, lens) in zip(short, frames, strict=True)]
 

@@ -12,7 +12,7 @@ import numpy as np
 from perception import _core
 from perception.errors import InputError
 from perception.export.neighbors import list_normals, neighbor_lists
-from perception.io.documents import read_json
+from perception.io.documents import read_json, refusing
 from perception.machine import require_memory
 from perception.types import PointCloud
 
@@ -162,10 +162,8 @@ def vote(labels: np.ndarray, segments: np.ndarray) -> np.ndarray:
 
 def read_segments(path: str | Path, num_points: int) -> np.ndarray:
     """Segments [P] int32 from a ScanNet `*.segs.json` (its list "segIndices"), one for each vertex."""
-    try:
+    with refusing(f"{path}: is no segmentation file: expected a list 'segIndices' ({{why}})"):
         values = np.asarray(read_json(Path(path))["segIndices"], np.int64)
-    except (KeyError, TypeError, OverflowError) as error:
-        raise InputError(f"{path}: is no segmentation file: expected a list 'segIndices' ({error})") from error
     if values.shape != (num_points,):
         raise InputError(f"{path}: lists {values.size} segments, the cloud has {num_points} points")
     return np.unique(values, return_inverse=True)[1].astype(np.int32)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from perception.geometry import camera_centres, check_similarity, far_from_most, move_points, scale_of
+from perception.geometry import camera_centres, check_similarity, far_from_most, move_points, scale_of, transform
 from perception.types import Scene, View
 
 FAR = 100.0
@@ -25,9 +25,8 @@ def recentred(scene: Scene) -> Scene:
     extent = float(distances[~far_from_most(centres)].max())
     if extent == 0 or np.linalg.norm(middle) <= FAR * extent:
         return scene
-    shift = np.eye(4)
-    shift[:3, 3] = -np.round(middle, -int(np.floor(np.log10(extent))))  # a round number, easy to remember
-    return moved_scene(scene, shift)
+    shift = -np.round(middle, -int(np.floor(np.log10(extent))))  # a round number, easy to remember
+    return moved_scene(scene, transform(np.eye(3), shift))
 
 
 def moved_scene(scene: Scene, b_from_a: np.ndarray) -> Scene:

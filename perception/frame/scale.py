@@ -12,7 +12,6 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.geometry import align_similarity, camera_centres
-from perception.io.documents import DAMAGE
 from perception.photos.decode import GPS_FOLDER, exif_of, open_photo
 from perception.photos.depth import load_depth
 from perception.photos.lens import load_pycolmap
@@ -167,7 +166,7 @@ def photo_position(photo: Path) -> np.ndarray | None:
             angles.append(-angle if str(tags[tag]).strip("\0 ").upper() == negative else angle)
         below = tags.get(_ALTITUDE) in (1, b"\x01")
         position = np.array([*angles, float(tags[_ALTITUDE + 1]) * (-1 if below else 1)])
-    except DAMAGE:  # InputError among them
+    except Exception:  # damaged tags raise errors of many classes
         return None
     latitude, longitude, _ = position
     known = np.isfinite(position).all() and abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude or longitude)

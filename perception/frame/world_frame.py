@@ -14,7 +14,7 @@ from perception.frame.gravity import Gravity, floor_height, gravity_of_scene
 from perception.frame.known_size import scale_of_board, scale_of_pixels, scale_of_tags
 from perception.frame.recentre import moved_scene
 from perception.frame.scale import Measurement, combined, known_length, scale_of_depth, scale_of_gps
-from perception.geometry import camera_centres
+from perception.geometry import camera_centres, transform
 from perception.photos.depth import load_depth
 from perception.types import Scene, View
 
@@ -157,6 +157,4 @@ def upright(pose: np.ndarray, points: np.ndarray, gravity: Gravity, unit: float)
     x = ahead / np.linalg.norm(ahead)
     axes = np.stack([x, np.cross(up, x), up])
     origin = eye + (floor_height(up, points, eye) - eye @ up) * up
-    map_from_world = np.eye(4)
-    map_from_world[:3, :3], map_from_world[:3, 3] = unit * axes, -unit * axes @ origin
-    return map_from_world
+    return transform(unit * axes, -unit * axes @ origin)

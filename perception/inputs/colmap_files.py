@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from perception.errors import InputError
-from perception.io.documents import brief, text_of
+from perception.io.documents import brief, refusing, text_of
 from perception.photos.lens import load_pycolmap
 
 _PARAMS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
@@ -77,10 +77,8 @@ def read_model(path: Path) -> Model:
     for image_id, camera in used.items():
         if camera in model.cameras:
             model.wrong.setdefault(image_id, model.cameras[camera])
-    try:
+    with refusing(f"{path}: not a readable COLMAP model ({{why}})"):
         model.reconstruction = _loaded(model)
-    except (ValueError, RuntimeError, LookupError, TypeError) as error:
-        raise InputError(f"{path}: not a readable COLMAP model ({brief(error)})") from error
     for image_id, image in model.reconstruction.images.items():
         if image.frame_id in model.frames:
             model.wrong.setdefault(image_id, model.frames[image.frame_id])

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from perception.errors import InputError
 from perception.geometry import interpolated_pose
 from perception.inputs.recordings import Frame, Recording
-from perception.io.documents import brief, read_json, text_of
+from perception.io.documents import read_json, refusing, text_of
 from perception.photos.decode import open_photo, photo_size
 from perception.photos.lens import opencv_lens
 from perception.photos.named_files import NamedFiles
@@ -122,11 +122,9 @@ def _tum(source: Path) -> Recording:
 def _listed(file: Path) -> tuple[np.ndarray, list[Path | None]]:
     """Times [N] in ascending order, and the files, None where they are missing."""
     files = NamedFiles(file.parent)
-    try:
+    with refusing(f"{file}: expected lines 'time file' ({{why}})"):
         rows = sorted(((float(row[0]), row[1:]) for row in _rows(file)), key=lambda row: row[0])
         found = [files.find(name[0]) or files.find(" ".join(name)) for _, name in rows]
-    except (ValueError, IndexError) as error:
-        raise InputError(f"{file}: expected lines 'time file' ({error})") from error
     return np.array([time for time, _ in rows]), found
 
 
@@ -201,13 +199,11 @@ def _redwood(source: Path) -> Recording:
 def _trajectory(file: Path, photos: int) -> dict[int, np.ndarray]:
     """Blocks of a line of three whole numbers, the first the number of the photo from 0, and four rows of a matrix."""
     rows = _rows(file)
-    try:
+    with refusing(f"{file}: expected blocks of a line 'i i i+1' and four rows of four numbers"):
         numbers = [int(row[0]) for row in rows[::5]]
         matrices = np.array([row for index, row in enumerate(rows) if index % 5], np.float64).reshape(-1, 4, 4)
         numbers = list(range(photos)) if len(numbers) == photos else numbers
         poses = dict(zip(numbers, matrices, strict=True))
-    except ValueError as error:
-        raise InputError(f"{file}: expected blocks of a line 'i i i+1' and four rows of four numbers") from error
     if min(numbers) < 0 or max(numbers) >= photos:
         raise InputError(f"{file}: holds a pose of photo {max(numbers)} (counted from 0), there are {photos} photos")
     return poses
@@ -224,22 +220,18 @@ def _images(folder: Path) -> list[Path]:
 def _numbers(file: Path, columns: int) -> np.ndarray:
     """[N, at least `columns`] float64."""
     rows = _rows(file)
-    try:
+    with refusing(f"{file}: expected lines of {columns} numbers ({{why}})"):
         table = np.array(rows, np.float64)
         if table.shape[1] < columns:
             raise ValueError(f"found {table.shape[1]}")
-    except ValueError as error:
-        raise InputError(f"{file}: expected lines of {columns} numbers ({brief(error)})") from error
     return table
 
 
 def _rows(file: Path) -> list[list[str]]:
     """The fields of each line that is not empty and no comment, parted by blanks or commas. InputError where there is
     none, and for decimal commas."""
-    try:
+    with refusing(f"{file}: cannot be read as text"):
         lines = text_of(file.read_bytes()).splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: cannot be read as text") from error
     lines = [line for line in lines if not line.lstrip().startswith("#")]
     if commas := [field for line in lines for field in line.split() if _COMMA.fullmatch(field) and field != line]:
         raise InputError(f"{file}: {commas[0]} has a decimal comma; write it with decimal points")
@@ -263,12 +255,10 @@ def _matrix_lens(file: Path, size: tuple[int, int]) -> Lens | None:
 
 
 def _open3d_lens(file: Path) -> Lens:
-    data = read_json(file)
-    try:
+    with refusing(f"{file}: expected Open3D's camera intrinsics: width, height, intrinsic_matrix"):
+        data = read_json(file)
         K = np.array(data["intrinsic_matrix"], np.float64).reshape(3, 3).T  # stored by columns
         return _lens((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), (int(data["width"]), int(data["height"])))
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{file}: expected Open3D's camera intrinsics: width, height, intrinsic_matrix") from error
 
 
 def _lens(values: tuple[float, ...], size: tuple[int, int]) -> Lens:

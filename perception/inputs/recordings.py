@@ -16,14 +16,13 @@ from perception.io.documents import safe_name
 from perception.photos.decode import read_picture
 from perception.photos.depth import read_depth
 from perception.photos.ignore_masks import mask_of
-from perception.photos.video import Chooser
+from perception.photos.video import MOST_FRAMES, Chooser
 from perception.photos.views import first_of, posed_view, rigid_pose
 from perception.progress import Progress
 from perception.sfm.options import NO_CLOUD, ReadOptions
 from perception.sfm.triangulate import posed_scene
 from perception.types import DepthImage, Lens, Scene, View
 
-MOST_FRAMES = 200
 LOOKED_AT = 10
 """Depth images from which the median depth of a recording is estimated."""
 NEAREST, FARTHEST = 0.1, 50.0

@@ -16,7 +16,7 @@ from perception.errors import InputError
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
 from perception.inputs.far import without_far
 from perception.inputs.start_cloud import start_points
-from perception.io.documents import brief, read_json, safe_name
+from perception.io.documents import brief, read_json, refusing, safe_name
 from perception.photos.decode import SUFFIXES, photo_size, why_left_out
 from perception.photos.ignore_masks import mask_of
 from perception.photos.lens import FISHEYE, PERSPECTIVE, camera_from_lens, opencv_lens
@@ -251,10 +251,8 @@ def _frames(file: Path, held_out: bool = False) -> list[_Frame]:
 
 def _pose(file: Path, frame: dict[str, Any]) -> np.ndarray:
     what = f"{file}: the pose of {frame['file_path']}"
-    try:
+    with refusing(f"{what} is not a 4×4 matrix of numbers"):
         matrix = np.asarray(frame["transform_matrix"], dtype=np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{what} is not a 4×4 matrix of numbers") from error
     if matrix.shape == (3, 4):
         matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
     return OPENCV_FROM_OPENGL @ inverse_se3(rigid_pose(matrix, what))

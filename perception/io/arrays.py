@@ -46,8 +46,8 @@ def read_npz(source: Path | bytes, file: Path, advice: str) -> dict[str, np.ndar
 
 
 def map_npy(file: Path) -> np.ndarray:
-    """The array of an .npy, memory-mapped read-only. Raises the exceptions in DAMAGE; ValueError for a header that
-    claims more than the file holds."""
+    """The array of an .npy, memory-mapped read-only. Of damaged bytes NumPy raises errors of many classes, as
+    SyntaxError; ValueError for a header that claims more than the file holds."""
     with file.open("rb") as stream:
         shape, fortran, dtype = _header(stream, file.stat().st_size)
         order: Any = "F" if fortran else "C"

@@ -17,6 +17,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.arrays import read_npz
 from perception.io.atomic import atomic_file
+from perception.io.documents import refusing
 from perception.io.ply import MOST_ROWS, Element, Lists, Property, Table, packed, read_body, read_ply, write_ply
 from perception.machine import require_memory
 from perception.types import PointCloud
@@ -240,12 +241,10 @@ def _read_pcd(path: Path) -> PointCloud:
         kind, left = " ".join(header["DATA"]).lower(), path.stat().st_size - file.tell()
         if kind not in ("ascii", "binary", "binary_compressed"):
             raise InputError(f"{path}: PCD DATA is '{kind}'; expected ascii, binary or binary_compressed")
-        try:
+        with refusing(f"{path}: PCD cannot be understood ({{why}})"):
             table = _pcd_table(header, left if kind == "binary" else None)
             if kind == "binary_compressed":
                 columns = _by_column(_unpacked(file, path), table)
-        except (KeyError, IndexError, ValueError, struct.error) as error:
-            raise InputError(f"{path}: PCD cannot be understood ({error})") from error
         if kind != "binary_compressed":
             columns = read_body(path, file, "<" if kind == "binary" else "", [table])[table.name]
     return _cloud_of({name: values for name, values in columns.items() if not name.startswith("_")}, path)

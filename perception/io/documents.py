@@ -7,34 +7,12 @@ from __future__ import annotations
 import codecs
 import json
 import re
-import struct
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from perception.errors import InputError
-
-DAMAGE = (
-    ArithmeticError,
-    AttributeError,
-    EOFError,
-    LookupError,
-    MemoryError,  # Pillow allocates the size given in a chunk header
-    OSError,
-    RuntimeError,  # NotImplementedError, RecursionError and "is encrypted" among them
-    SyntaxError,  # numpy reads the header of an array as Python
-    TypeError,
-    ValueError,
-    struct.error,
-    tokenize.TokenError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
-"""Exceptions that numpy, zipfile, PyYAML and Pillow raise on bytes that are not what they read, or a part of it."""
 
 
 def text_of(data: bytes, errors: str = "strict") -> str:

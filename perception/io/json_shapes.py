@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from datetime import datetime
 from functools import cache
 from pathlib import Path
@@ -41,22 +42,15 @@ def parsed(raw: bytes) -> Any:
 # ------------------------------------------------------------------ values
 
 
-def _path(value: Any) -> str:
-    if not isinstance(value, str) or "\0" in value:
-        raise ValueError("expected a path")
-    return value
+def _expecting(what: str, good: Callable[[Any], object]) -> AfterValidator:
+    """A check that a value is `good`; what: its kind, for the message."""
 
+    def checked(value: Any) -> Any:
+        if not good(value):
+            raise ValueError(f"expected {what}")
+        return value
 
-def _text(value: str) -> str:
-    if not value.isprintable() and re.search(r"[\ud800-\udfff]", value):
-        raise ValueError("expected text, found half of a surrogate pair")
-    return value
-
-
-def _plain_name(value: str) -> str:
-    if Path(value).name != value or "\0" in value:
-        raise ValueError("expected the name of a file")
-    return value
+    return AfterValidator(checked)
 
 
 def _photo_name(value: Any) -> str:
@@ -73,27 +67,8 @@ def _moment(value: str) -> str:
     return value
 
 
-def _similarity(value: list[list[float]]) -> list[list[float]]:
-    check_similarity(value, "the matrix")
-    return value
-
-
-def _pose(value: list[list[float]]) -> list[list[float]]:
-    if abs(scale_of(check_similarity(value, "the pose")) - 1) > 1e-3:
-        raise ValueError("expected a rigid transform")
-    return value
-
-
-def _intrinsics(value: list[list[float]]) -> list[list[float]]:
-    if not (value[0][0] > 0 and value[1][1] > 0 and value[1][0] == 0 and value[2] == [0, 0, 1]):
-        raise ValueError("expected focal lengths above 0 and a last row 0 0 1")
-    return value
-
-
-def _direction(value: list[float]) -> list[float]:
-    if abs(np.linalg.norm(value) - 1) > 1e-3:
-        raise ValueError("expected a vector of length 1")
-    return value
+def _is_intrinsics(K: list[list[float]]) -> bool:
+    return K[0][0] > 0 and K[1][1] > 0 and K[1][0] == 0 and K[2] == [0, 0, 1]
 
 
 Count = Annotated[int, Field(ge=0, le=LARGEST)]
@@ -103,19 +78,25 @@ Number = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
 Length = Annotated[float, Field(ge=0, le=FARTHEST)]
 Positive = Annotated[float, Field(gt=0, le=FARTHEST)]
 Share = Annotated[float, Field(ge=0, le=1)]
-Text = Annotated[str, AfterValidator(_text)]
+Text = Annotated[
+    str,
+    _expecting(
+        "text, found half of a surrogate pair",
+        lambda value: value.isprintable() or not re.search(r"[\ud800-\udfff]", value),
+    ),
+]
 Moment = Annotated[str, AfterValidator(_moment)]
-PathText = Annotated[Any, AfterValidator(_path)]
-FileName = Annotated[str, AfterValidator(_plain_name)]
+PathText = Annotated[Any, _expecting("a path", lambda value: isinstance(value, str) and "\0" not in value)]
+FileName = Annotated[str, _expecting("the name of a file", lambda name: Path(name).name == name and "\0" not in name)]
 PhotoName = Annotated[Any, AfterValidator(_photo_name)]
 Point = Annotated[list[Number], Len(3, 3)]
 Sides = Annotated[list[Length], Len(3, 3)]
-Direction = Annotated[Point, AfterValidator(_direction)]
+Direction = Annotated[Point, _expecting("a vector of length 1", lambda v: abs(np.linalg.norm(v) - 1) <= 1e-3)]
 Matrix3 = Annotated[list[Point], Len(3, 3)]
-Intrinsics = Annotated[Matrix3, AfterValidator(_intrinsics)]
+Intrinsics = Annotated[Matrix3, _expecting("focal lengths above 0 and a last row 0 0 1", _is_intrinsics)]
 Matrix4 = Annotated[list[Annotated[list[Number], Len(4, 4)]], Len(4, 4)]
-Similarity = Annotated[Matrix4, AfterValidator(_similarity)]
-Pose = Annotated[Matrix4, AfterValidator(_pose)]
+Similarity = Annotated[Matrix4, AfterValidator(lambda value: check_similarity(value, "the matrix"))]
+Pose = Annotated[Similarity, _expecting("a rigid transform", lambda matrix: abs(scale_of(matrix) - 1) <= 1e-3)]
 
 
 def typed(shape: Any) -> Any:

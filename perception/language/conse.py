@@ -27,7 +27,6 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.arrays import map_npy
 from perception.io.atomic import atomic_file
-from perception.io.documents import DAMAGE
 from perception.language import minilm
 from perception.language.base import Part, Reading, check_images, check_texts, packaged_file, unit_rows
 from perception.language.household import CLASSES, class_names, household_thing
@@ -147,7 +146,7 @@ def _cached(names: list[list[str]], encode: Any) -> np.ndarray:
         known = np.array(map_npy(path))
         if known.shape == (len(names), MiniLM.dim) and known.dtype == np.float32:
             return known
-    except DAMAGE:
+    except Exception:  # damaged files raise errors of many classes
         pass  # missing or damaged: recomputed below
     embedded = encode(flat)
     sizes = np.array([len(group) for group in names])

@@ -13,9 +13,9 @@ from perception.errors import InputError
 REPORT = "report.html"
 FACTS = "map.json"
 STORE = "store.json"
+"""In the folder of a store of many maps, the list of its maps."""
 IGNORED = "ignored.png"
 """The mask of what stays in the photos and is ignored, as in map.json, for people to look at."""
-"""In the folder of a store of many maps, the list of its maps."""
 EDITABLE = "instances.json"
 """Users may edit labels in this file by hand, so a changed checksum is reported and not an error."""
 DATA = (

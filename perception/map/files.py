@@ -14,7 +14,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.arrays import map_npy, read_npz
 from perception.io.atomic import current
-from perception.io.documents import DAMAGE, brief
+from perception.io.documents import brief
 from perception.io.json_shapes import parsed
 from perception.io.ply import map_ply
 from perception.map.checksums import EDITABLE, FACTS, STORE, check_file, check_sizes, damaged
@@ -85,7 +85,7 @@ class MapFiles:
             array = map_npy(file)
         except FileNotFoundError as error:
             raise damaged(file, "is missing") from error
-        except DAMAGE as error:
+        except Exception as error:  # NumPy's, of many classes
             raise damaged(file, f"cannot be read ({brief(error)})") from error
         kind = "i" if name == "instance_ids" else "f"
         if array.ndim != sides or array.dtype.kind != kind or array.dtype.itemsize > 4:
@@ -100,8 +100,9 @@ class MapFiles:
         if name == "views":
             return views_of_facts(self.facts, self.path / FACTS)
         if name in ARCHIVES:
-            arrays = self._unpack(name)
-            with _damage_in(self.path / f"{name}.npz"):
+            file, raw = self.path / f"{name}.npz", self._archives.get(name)
+            arrays = {} if raw is None else read_npz(raw, file, "the map is damaged, build it again")
+            with _damage_in(file):
                 check_archive(name, arrays, self.instances, len(self._rows))
             return arrays
         self._check_contents()
@@ -125,11 +126,6 @@ class MapFiles:
                 if name != EDITABLE:
                     check_file(self.path, self.info, name)
             self._checked = True
-
-    def _unpack(self, name: str) -> dict[str, np.ndarray]:
-        """The arrays of an .npz, {} if it does not exist; InputError when a CRC-32 differs."""
-        raw = self._archives.get(name)
-        return {} if raw is None else read_npz(raw, self.path / f"{name}.npz", "the map is damaged, build it again")
 
 
 def _columns(names: list[str]) -> Callable[[np.ndarray], np.ndarray]:
@@ -208,11 +204,8 @@ def _read_facts(path: Path) -> tuple[dict[str, Any], bytes]:
 
 
 def _read_instances(file: Path, facts: dict[str, Any]) -> tuple[list[dict[str, Any]], bytes]:
-    try:
-        raw = file.read_bytes()
-    except OSError as error:
-        raise damaged(file, f"cannot be read ({error})") from error
     with _damage_in(file):
+        raw = file.read_bytes()
         value = parsed(raw)
         check_instances(value, facts)
     return value["instances"], raw
@@ -223,5 +216,5 @@ def _damage_in(file: Path) -> Iterator[None]:
     """Turns a ValueError of `map_model` into the InputError for `file`."""
     try:
         yield
-    except ValueError as error:
+    except (OSError, ValueError) as error:
         raise damaged(file, str(error)) from error

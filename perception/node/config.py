@@ -27,16 +27,11 @@ class NodeConfig(EngineSettings):
     map_points: int = Field(
         1_000_000, ge=0, description="most points of the latched cloud, evenly thinned; 0: no cloud of the map"
     )
-    photos: str | None = Field(None, description="folder where the map's photos may be read beside its own")
+    photos: Path | None = Field(None, description="folder where the map's photos may be read beside its own")
     health_seconds: float = Field(1.0, ge=0.05, le=3600, description="seconds between two health messages")
     discovery_seconds: float = Field(
         1.0, ge=0, le=60, description="seconds in which another node of this name is looked for"
     )
-
-    @property
-    def photos_folder(self) -> Path | None:
-        """`photos` as a path."""
-        return None if self.photos is None else Path(self.photos)
 
     @property
     def domain_id(self) -> int:

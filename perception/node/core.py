@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from perception.errors import InputError
+from perception.io.documents import refusing
 from perception.node import answers
 from perception.node.config import NodeConfig
 from perception.node.localise import Localising
@@ -45,10 +46,8 @@ def read_questions(data: str) -> list[Question]:
         raise InputError(f"prompt: has {size} bytes, expected at most {MAX_BYTES}")
     if not data.lstrip().startswith("{"):
         return [Question(Request(data))]
-    try:
+    with refusing("prompt: begins like JSON but is none ({why})"):
         value = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"prompt: begins like JSON but is none ({error})") from error
     identity, want = value.pop("id", None), value.pop("want", "hits")
     if identity is not None and not (isinstance(identity, str) and len(identity) <= _LONGEST_ID):
         raise InputError(f"prompt: id is to be a text of at most {_LONGEST_ID} characters")
@@ -171,7 +170,7 @@ class Core:
             if len(questions) != 1:
                 raise InputError("query: one text for a name; give further texts as further names")
             question = questions[0]
-            reply = question.request.answered(gmap, time.monotonic())
+            reply = question.request.answered(gmap)
         except InputError as error:
             return self._error_value(error, name)
         if question.points:

@@ -29,7 +29,7 @@ class Localising:
     """
 
     def __init__(self, engine: QueryEngine, transport: Any, config: NodeConfig) -> None:
-        self._engine, self._transport, self.photos = engine, transport, config.photos_folder
+        self._engine, self._transport, self.photos = engine, transport, config.photos
         self._lens: Lens | None = None
         self._one = threading.Lock()
         self.dropped = 0

@@ -42,7 +42,9 @@ warnings.filterwarnings("ignore", category=UserWarning, module="PIL")
 def photo_size(path: Path, as_stored: bool = False) -> tuple[int, int]:
     """(width, height) of what read_photo returns, from the header: large photos reduced."""
     with open_photo(path) as image:
-        size = reduced_size(*_stored_size(image), _reduction(image))
+        tags = getattr(image, "tag_v2", {})  # depending on its version, Pillow has rotated the size of a TIFF
+        width, height = int(tags.get(0x0100, image.width)), int(tags.get(0x0101, image.height))
+        size = reduced_size(width, height, _reduction(image))
         turned = exif_of(image, path).get(ORIENTATION) in (5, 6, 7, 8)  # other values do not swap the sides
         return size[::-1] if turned and not as_stored else size
 
@@ -51,11 +53,6 @@ def is_turned(path: Path) -> bool:
     """Whether EXIF says that the photo is to be rotated or mirrored."""
     with open_photo(path) as image:
         return exif_of(image, path).get(ORIENTATION) in _BACK
-
-
-def _stored_size(image: Image.Image) -> tuple[int, int]:
-    tags = getattr(image, "tag_v2", {})  # depending on its version, Pillow has rotated the size of a TIFF
-    return int(tags.get(0x0100, image.width)), int(tags.get(0x0101, image.height))
 
 
 def reduced_size(width: int, height: int, factor: int) -> tuple[int, int]:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.documents import refusing
 from perception.types import Lens
 
 MIN_FOCAL, MOST_PIXELS, MOST_SIDE = 1e-2, 1e9, 1 << 20
@@ -63,15 +64,12 @@ def lens_text(lens: Lens) -> str:
 def camera_from_lens(lens: Lens, camera_id: int = 1) -> Any:
     """The pycolmap camera of a lens."""
     pycolmap = load_pycolmap()
-    try:
-        camera = pycolmap.Camera(
-            model=lens.model, width=lens.width, height=lens.height, params=list(lens.params), camera_id=camera_id
-        )
-        valid = camera.verify_params() and np.isfinite(lens.params).all()
-    except (ValueError, RuntimeError) as error:
-        raise InputError(f"camera model {lens.model} is not known to pycolmap, or its parameters do not fit") from error
+    size, params = {"width": lens.width, "height": lens.height}, list(lens.params)
+    with refusing(f"camera model {lens.model} is not known to pycolmap, or its parameters do not fit"):
+        camera = pycolmap.Camera(model=lens.model, params=params, camera_id=camera_id, **size)
+        valid = camera.verify_params() and np.isfinite(params).all()
     if not valid or camera.mean_focal_length() <= 0:
-        raise InputError(f"camera {lens.model}: the parameters {list(lens.params)} are not valid")
+        raise InputError(f"camera {lens.model}: the parameters {params} are not valid")
     return camera
 
 
@@ -88,10 +86,8 @@ def pinhole_from_lens(lens: Lens) -> tuple[tuple[float, float, float, float], in
     As COLMAP's default: focal lengths are kept, the size is chosen so that no pixel is blank (0.2 to 2 times that of
     the photo). Values of a lens without distortion are returned unchanged. InputError where undistortion fails."""
     ideal, plain, pycolmap = camera_from_lens(lens), is_pinhole(lens), load_pycolmap()
-    try:
+    with refusing(f"camera model {lens.model} cannot be undistorted to a pinhole"):
         ideal = ideal if plain else pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), ideal)
-    except (ValueError, RuntimeError) as error:
-        raise InputError(f"camera model {lens.model} cannot be undistorted to a pinhole") from error
     fx, fy = float(ideal.focal_length_x), float(ideal.focal_length_y)
     cx, cy = float(ideal.principal_point_x), float(ideal.principal_point_y)
     # Beyond the range of real cameras, float32 cannot resolve the rays of pixels.

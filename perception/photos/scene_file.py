@@ -10,7 +10,6 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.arrays import read_npz
 from perception.io.atomic import atomic_directory
-from perception.io.documents import DAMAGE
 from perception.photos.view_json import view_from_json, view_json
 from perception.types import Scene, View
 
@@ -34,5 +33,5 @@ def load_saved_scene(folder: Path) -> Scene | None:
         points, colors = arrays["points"], arrays["colors"]
         views: list[View] = [view_from_json(entry) for entry in facts["views"]]
         return Scene(views, points, colors, facts["metric"], facts["frame"], facts["report"])
-    except DAMAGE as error:
+    except Exception as error:  # damaged files raise errors of many classes
         raise InputError(f"{folder}: the kept poses are damaged; delete {folder.parent} to start over") from error

@@ -19,6 +19,7 @@ from pydantic import AfterValidator, Field, Strict
 
 from perception.errors import InputError
 from perception.io.atomic import pointed
+from perception.io.documents import refusing
 from perception.io.json_shapes import (
     Bytes,
     Count,
@@ -174,7 +175,5 @@ def _lens_of(entry: list[Any] | None) -> Lens | None:
 def views_of_facts(info: dict[str, Any], file: Path) -> list[StoredView]:
     """The views that map.json records, `info` being its content and `file` its name for messages.
     InputError when the record is malformed."""
-    try:
+    with refusing(f"{file}: its views cannot be understood ({{why}}); the map is damaged"):
         return [view_from_json(entry) for entry in info.get("views", [])]
-    except (ValueError, TypeError, KeyError, IndexError, OverflowError, AttributeError) as error:
-        raise InputError(f"{file}: its views cannot be understood ({error}); the map is damaged") from error

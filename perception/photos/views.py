@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from perception.errors import InputError
-from perception.geometry import nearest_rotation
+from perception.geometry import nearest_rotation, transform
 from perception.photos.decode import is_turned, photo_size
 from perception.photos.lens import is_pinhole, pinhole_from_lens, rescale_lens, resized
 from perception.types import Lens, View
@@ -37,9 +37,7 @@ def rigid_pose(matrix: np.ndarray, what: str) -> np.ndarray:
     rotation = nearest_rotation(matrix[:3, :3])
     if np.abs(matrix[:3, :3] - rotation).max() > 1e-2:
         raise InputError(f"{what} is not a rigid transform (scaled, sheared or mirrored); repair or remove that frame")
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, matrix[:3, 3]
-    return pose
+    return transform(rotation, matrix[:3, 3])
 
 
 def posed_view(

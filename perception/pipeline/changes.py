@@ -15,7 +15,7 @@ from perception.config import MapConfig
 from perception.errors import InputError
 from perception.inputs.load import input_files
 from perception.io.atomic import atomic_file
-from perception.io.documents import read_json
+from perception.io.documents import read_json, refusing
 from perception.masks.sam_models import sam_graphs
 from perception.onnx.sessions import side_files
 from perception.onnx.store import resolve
@@ -118,10 +118,8 @@ def refuse_changed(output: Path, info: dict[str, Any], now: Inputs) -> None:
 
 def _compare(source: Path, before: Any, now: Inputs, since: str, todo: str) -> None:
     """InputError with the first files that differ."""
-    try:
+    with refusing(f"{source}: its list of input files is damaged; {todo}"):
         old, new = ({(key, name): stat for key in one for name, stat in one[key].items()} for one in (before, now))
-    except (AttributeError, LookupError, TypeError) as error:
-        raise InputError(f"{source}: its list of input files is damaged; {todo}") from error
     state = dict.fromkeys(old, "gone") | {key: "changed" if key in old else "new" for key in new}
     changed = [f"{key[1]} ({state[key]})" for key in sorted(state) if old.get(key) != new.get(key)]
     if changed:

@@ -21,7 +21,6 @@ import errno
 import hashlib
 import json
 import os
-import pickle
 import shutil
 import time
 from collections.abc import Iterator
@@ -34,6 +33,7 @@ from perception.errors import InputError
 from perception.gaussians.train import Trainer
 from perception.inputs.readers import EXPECTED
 from perception.io.atomic import atomic_file
+from perception.io.documents import refusing
 from perception.machine import peak_memory_mib
 from perception.map.replace import writing
 from perception.photos.video import FRAMES_RECORD
@@ -177,11 +177,9 @@ def load_checkpoint(path: Path, mark: str) -> dict[str, Any] | None:
 
     if not path.is_file():
         return None
-    try:
+    with refusing(f"{path}: the checkpoint is damaged; delete {path.parent} to start over"):
         held = torch.load(path, weights_only=True)
         found, state = held["mark"], held["state"]
-    except (OSError, RuntimeError, ValueError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
-        raise InputError(f"{path}: the checkpoint is damaged; delete {path.parent} to start over") from error
     if found != mark:
         todo = f"repeat the first command with --resume, or delete {path.parent} to start over"
         raise InputError(f"{path}: was made with other settings or another input; {todo}")

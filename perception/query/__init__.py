@@ -5,7 +5,7 @@ with QueryEngine("kitchen.gsmap") as engine  for servers: bounded request queue,
 """
 
 from perception.query.hit import Description, Hit, Neighbor
-from perception.query.load import load_map
+from perception.query.map_store import load_map
 from perception.query.query_map import QueryMap
 from perception.query.where import Frame, Where, axis_box
 

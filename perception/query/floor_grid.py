@@ -10,7 +10,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.frame.gravity import floor_height
-from perception.geometry import camera_centres, rotations
+from perception.geometry import camera_centres, rotations, transform
 from perception.map.map import Map
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1  # nav_msgs/OccupancyGrid
@@ -46,9 +46,7 @@ class Surface:
         grid = np.full(size[::-1], UNKNOWN, np.int8)
         for rows, value in ((~occupied, FREE), (occupied, OCCUPIED)):
             grid[tuple((cells[rows] - low).T[::-1])] = value
-        level_from_grid = np.eye(4)
-        level_from_grid[:2, 3] = low * resolution
-        return grid, self.map_from_level @ level_from_grid
+        return grid, self.map_from_level @ transform(np.eye(3), [*low * resolution, 0.0])
 
 
 def level_surface(gmap: Map) -> Surface:
@@ -69,7 +67,7 @@ def level_surface(gmap: Map) -> Surface:
     floor = floor_height(np.eye(3)[2], means, np.median(camera_centres(gmap.poses) @ axes, axis=0))
     points = np.concatenate([means + u * first + v * second for u, v in DISC]) - [0, 0, floor]
     rows = np.tile(np.flatnonzero(solid), len(DISC))
-    return Surface(points, rows, np.r_[np.c_[axes, axes @ [0, 0, floor]], [[0, 0, 0, 1]]], gmap.path)
+    return Surface(points, rows, transform(axes, axes @ [0, 0, floor]), gmap.path)
 
 
 def floor_grid(gmap: Map, resolution: float, step: float = STEP) -> tuple[np.ndarray, np.ndarray]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from contextlib import AbstractContextManager
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.arrays import read_npz
-from perception.io.documents import brief
+from perception.io.documents import brief, refusing
 from perception.io.json_shapes import check, parsed
 from perception.language.colors import COLOR_WORDS
 from perception.language.description import check_encoder
@@ -217,9 +218,9 @@ class _Maps:
         self.entries = entries
         for entry in entries:  # before memory is taken for so many
             file = path / "maps" / entry["file"]
-            if file.is_file() and entry["instances"] * RECORD.itemsize > file.stat().st_size:
-                problem = f"maps: {file.name} is too small for its {entry['instances']} instances"
-                raise _damaged(path / STORE, ValueError(problem))
+            with _reading(path / STORE):
+                if file.is_file() and entry["instances"] * RECORD.itemsize > file.stat().st_size:
+                    raise ValueError(f"maps: {file.name} is too small for its {entry['instances']} instances")
         counts = [entry["instances"] for entry in entries]
         self.owner = np.repeat(np.arange(len(counts)), counts)
         stops = np.cumsum(counts).tolist()
@@ -229,7 +230,7 @@ class _Maps:
         for own, entry in zip(self.slices, entries, strict=True):
             file = path / "maps" / entry["file"]
             arrays = read_npz(file, file, "index its map again")
-            try:
+            with _reading(file):
                 for name, of_maps in ragged.items():
                     of_maps.append(arrays.pop(name, None))
                 for name, array in arrays.items():
@@ -238,9 +239,7 @@ class _Maps:
                     if name not in self._rows:
                         self._rows[name] = np.empty((sum(counts), *array.shape[1:]), array.dtype)
                     self._rows[name][own] = array
-            except (ValueError, TypeError, KeyError) as error:
-                raise _damaged(file, error) from error
-        try:
+        with _reading(path / STORE):
             self._things, self.records = (self._rows.pop(name).view(kind)[:, 0] for name, kind in _RECORDS.items())
             self._label_rows, self._label_null = (np.concatenate(ragged[name]) for name in ("label_rows", "label_null"))
             self.names = [parsed(names.tobytes()) for names in ragged["names"]]
@@ -248,8 +247,6 @@ class _Maps:
                 check(NAMES, names)
                 if not len(names["labels"]) == count == len(names["texts"] or names["labels"]):
                     raise ValueError(f"names: expected those of {count} instances")
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
-            raise _damaged(path / STORE, error) from error
         self.views, poses = ragged["views"], ragged["poses"]
         self.boxes = [
             p if p is None else LevelBoxes(p[:, 0], p[:, 1], c) for p, c in zip(ragged["places"], poses, strict=True)
@@ -273,19 +270,33 @@ class _Maps:
 def read_store(path: Path) -> tuple[dict[str, Any], bytes]:
     """store.json and its bytes; InputError when it is damaged or of another version."""
     file = path / STORE
-    try:
+    with _reading(file):
         raw = file.read_bytes()
         facts = parsed(raw)
         if isinstance(facts, dict) and (version := facts.get("format_version")) != FORMAT_VERSION:
             found = f"format_version is {brief(version)}, this program reads {FORMAT_VERSION}"
             raise InputError(f"{file}: {found}; index the maps into a new store")
         check(STORED, facts)
-    except InputError:
-        raise
-    except (OSError, ValueError) as error:
-        raise _damaged(file, error) from error
     return facts, raw
 
 
-def _damaged(file: Path, error: Exception) -> InputError:
-    return InputError(f"{file}: cannot be read as a store ({error}); index the maps into a new store")
+def _reading(file: Path) -> AbstractContextManager[None]:
+    return refusing(f"{file}: cannot be read as a store ({{why}}); index the maps into a new store")
+
+
+def load_map(path: str | Path, encoders: Encoders | None = None) -> QueryMap:
+    """Opens a map directory, a million Gaussians in well under a second, or a store of many maps: a `MapStore`, which
+    answers `query` as a map does, and raises InputError for all else that needs one map.
+
+    encoders: makes an encoder from its name in the map's config; perception.language.encoders.make_encoder when None.
+    Raises InputError when `path` is neither, damaged, or of another format version.
+
+    >>> gmap = load_map("kitchen.gsmap")
+    >>> gmap.counts
+    {'instances': 9, 'gaussians': 3000}
+    >>> gmap.query("red mug", top_k=3)[0].points.shape[1]
+    3
+    """
+    if (Path(path) / STORE).is_file():
+        return MapStore(Path(path), encoders)  # type: ignore[return-value]
+    return QueryMap.open(Path(path), encoders=encoders)

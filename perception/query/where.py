@@ -10,7 +10,7 @@ import numpy as np
 
 from perception.boxes import move_box
 from perception.errors import InputError
-from perception.geometry import check_similarity, move_points, numbers, scale_of
+from perception.geometry import check_similarity, move_points, numbers, scale_of, transform
 from perception.types import OrientedBox
 
 
@@ -143,9 +143,7 @@ def check_box(box: Any) -> OrientedBox:
     rotation = numbers(box.rotation, "region: rotation")
     if center.shape != (3,) or extent.shape != (3,) or rotation.shape != (3, 3) or (extent < 0).any():
         raise InputError("region: expected a center [3], an extent [3] >= 0 and a rotation [3, 3]")
-    pose = np.eye(4)
-    pose[:3, :3] = rotation
-    check_similarity(pose, "region: rotation")
+    check_similarity(transform(rotation, [0.0, 0.0, 0.0]), "region: rotation")
     if abs(np.linalg.det(rotation) - 1) > 1e-3:
         raise InputError("region: rotation is scaled, expected rows of length 1")
     return OrientedBox(center, rotation, extent)

@@ -168,6 +168,10 @@ class _Album:
         except (InputError, KeyError):
             return None
 
+    def visit(self, name: str) -> int:
+        """The number of the visit that took a view's photo; 0 for a name that is none of the map's."""
+        return int(getattr(self.views.get(name), "visit", 0))
+
     def _camera(self, name: str) -> tuple[torch.Tensor, torch.Tensor, int, int]:
         """camera_from_world [4, 4], K [3, 3], width and height of a view's photo as it was trained."""
         view, photo = self.views[name], self.photo(name)
@@ -189,16 +193,18 @@ class _Album:
         return render_silhouettes(self.gaussians, [self.gmap.instance_ids], *self._camera(name))[0].ids
 
     def spot(self, box: dict[str, Any], first: int, last: int) -> np.ndarray | None:
-        """The photo of the visits `first` to `last` on which the box, as in instances.json, is largest, cut out with a
-        margin; None when none shows all of it."""
+        """The photo of the visits `first` to `last` that shows most of the box, as in instances.json, cut out with a
+        margin; None when none shows half of it."""
         corners = np.array(box["center"]) + CORNERS * np.array(box["extent"]) @ np.array(box["rotation"])
         boxes = []
         for name, view in self.views.items():
             x, y, depth = view.camera_from_world[:3, :3] @ corners.T + view.camera_from_world[:3, 3:]
-            if first <= getattr(view, "visit", 0) <= last and depth.min() > 0:
+            if first <= self.visit(name) <= last and depth.min() > 0:
                 u, v = (view.K[:2, :2] @ [x, y] / depth + view.K[:2, 2:]) / [[view.width], [view.height]]
-                if min(*u, *v) >= 0 and max(*u, *v) <= 1:
-                    boxes.append((float(np.ptp(u) * np.ptp(v)), name, (u.min(), v.min(), u.max(), v.max())))
+                seen = [np.clip(side, 0, 1) for side in (u, v)]
+                area, whole = (float(np.ptp(x) * np.ptp(y)) for x, y in (seen, (u, v)))
+                if area >= whole / 2:
+                    boxes.append((area, name, [end(side) for end in (np.min, np.max) for side in seen]))
         for _, name, shares in sorted(boxes, reverse=True):
             if (photo := self.photo(name)) is not None:
                 x0, y0, x1, y1 = (int(share * side) for share, side in zip(shares, photo.shape[1::-1] * 2, strict=True))
@@ -263,8 +269,9 @@ def _view_rows(album: _Album) -> list[dict[str, np.ndarray]]:
 
 
 def _overview(gmap: Map, album: _Album) -> dict[str, np.ndarray]:
-    """Instances and features of the middle photo of the sequence."""
-    names, still = list(album.views), gmap.info.get("scene", {}).get("still")
+    """Instances and features of the middle photo of the newest visit."""
+    names = [name for name in album.views if album.visit(name) == gmap.newest_visit]
+    still = gmap.info.get("scene", {}).get("still")
     name = names[len(names) // 2] if names else ""
     photo, shown = album.photo(name), {}
     if still:
@@ -279,10 +286,15 @@ def _overview(gmap: Map, album: _Album) -> dict[str, np.ndarray]:
 
 
 def _best_picture(opened: QueryMap, index: int, album: _Album, cropped: bool) -> np.ndarray | None:
-    """The photo that shows the instance best, with its outline; cropped: cut out with a margin. None without one."""
-    hit = opened.hit(index)
-    photo = album.photo(hit.views[0]) if hit.views else None
-    if photo is None or not (mask := album.ids(hit.views[0]) == hit.instance_id).any():
+    """The photo that shows the instance best where it stands today, with its outline; cropped: cut out with a margin.
+    Of one that only photos of its earlier spots show well, a cut of these. None without a photo."""
+    hit, entry = opened.hit(index), opened.instances[index]
+    name = next((name for name in hit.views if stood(entry, album.visit(name)) is entry), None)
+    if name is None and (best := opened.best_view(hit.instance_id)) is not None:
+        earlier = album.photo(best[0].name)
+        return None if earlier is None else cut_out(earlier, best[1], SIZES[0][0])
+    photo = None if name is None else album.photo(name)
+    if photo is None or not (mask := album.ids(name) == hit.instance_id).any():
         return None
     picture = outline(photo, mask)
     if not cropped:

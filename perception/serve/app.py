@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, TypeVar
@@ -137,7 +136,7 @@ def add_searches(app: FastAPI, queries: MapQueries) -> None:
         requests = body.requests()
 
         def work(gmap: QueryMap) -> dict[str, Any]:
-            results = [request.answered(gmap, time.monotonic()).to_json() for request in requests]
+            results = [request.answered(gmap).to_json() for request in requests]
             return {"results": results, **source(gmap, requests[0].frame), **gmap.visits_json()}
 
         return JSONResponse(await queries.result(map_id, None, work))

@@ -103,9 +103,8 @@ class QueryEngine:
 
     def submit(self, request: Request | str, timeout: float | None = None) -> Future[Reply]:
         """Queues a prompt and returns its future, which raises as `ask` does. EngineBusy when the queue is full."""
-        since = time.monotonic()
         prompt = Request(request) if isinstance(request, str) else request
-        return self.run(lambda gmap: prompt.answered(gmap, since), timeout)
+        return self.run(prompt.answered, timeout)
 
     def run(self, work: Callable[[QueryMap], T], timeout: float | None = None, map_id: str | None = None) -> Future[T]:
         """Queues `work`, which a worker thread calls with the current map. EngineBusy when the queue is full. The

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from perception.errors import InputError, refuse_named_pipe
+from perception.io.documents import refusing
 
 MAKE_TOKEN = "openssl rand -hex 24 > token, then --token-file token"
 _MIN_TOKEN = 16
@@ -64,12 +65,9 @@ def url_host(host: str) -> str:
 
 def listen(host: str, port: int) -> socket.socket:
     """A bound, listening TCP socket; InputError naming the argument when the address or port is not available."""
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )[0]
-    except (OSError, UnicodeError) as error:
-        raise InputError(f"--host {host}: is no address of this machine ({error})") from error
+    with refusing(f"--host {host}: is no address of this machine ({{why}})"):
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    family, kind, protocol, _, address = found[0]
     sock = socket.socket(family, kind, protocol)
     try:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a restart must not wait for old connections
@@ -88,10 +86,8 @@ def listen(host: str, port: int) -> socket.socket:
 def read_token(path: Path) -> str:
     """The token in a file, without outer white space; InputError when it is unreadable, too short or not ASCII."""
     refuse_named_pipe(path)
-    try:
+    with refusing(f"{path}: cannot be read as a token ({{why}})"):
         token = path.read_text(encoding="utf-8").strip()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as a token ({error})") from error
     if len(token) < _MIN_TOKEN or not token.isascii() or not token.isprintable() or " " in token:
         raise InputError(
             f"{path}: holds {len(token)} characters, expected one ASCII word of at least {_MIN_TOKEN}: {MAKE_TOKEN}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import io
 import threading
 from concurrent.futures import Future
@@ -87,10 +86,8 @@ def placed(
 
 def decoded(picture: str) -> bytes:
     """The bytes of a picture in base64. InputError for other text."""
-    try:
+    with refusing("picture: no base64 ({why})"):
         return base64.b64decode(picture, validate=True)
-    except (binascii.Error, ValueError) as error:
-        raise InputError(f"picture: no base64 ({error})") from error
 
 
 def localised(gmap: QueryMap, picture: bytes, lens: Lens | None, photos: Path | None) -> Localised | NotHere:

@@ -231,19 +231,13 @@ class Localise(Tool, GivenPhoto):
 
 
 TOOLS: dict[str, type[Tool]] = {"localise": Localise, "find": Find, "list_objects": ListObjects, "describe": Describe}
-TOOLS |= {"what_changed": WhatChanged}
-TOOLS |= {"nearest": Nearest, "where_to_stand": WhereToStand, "measure": Measure}
+TOOLS |= {"what_changed": WhatChanged, "nearest": Nearest, "where_to_stand": WhereToStand, "measure": Measure}
 
 
 @lru_cache(maxsize=2)  # of the map, and of the map with what is gone
 def _names(gmap: QueryMap) -> list[list[str]]:
     """The likely names of a map's instances in their order; empty lists when it cannot answer prompts."""
     return gmap.likely_names() if gmap.problem is None else [[] for _ in gmap.instances]
-
-
-def _known_names(gmap: QueryMap) -> None:
-    """`_names` of the map with what is gone."""
-    _names(gmap.last_known)
 
 
 @lru_cache(maxsize=1)
@@ -298,7 +292,7 @@ def make_server(engine: QueryEngine, photos: Path | None = None) -> Server[Any]:
 
     import perception.export.render  # noqa: F401  # torch, here and not within the time of the first answer
 
-    for learn in (_names, _known_names, _relations):  # which may take longer than an answer
+    for learn in (_names, lambda gmap: _names(gmap.last_known), _relations):  # which may take longer than an answer
         learn(engine.current)
         engine.on_reload(learn)
     if outside := photos_outside(engine.current, photos):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from pathlib import Path
@@ -133,22 +132,22 @@ class Request:
     def __post_init__(self) -> None:
         check_prompt(self.text, self.top_k, self.min_score)
 
-    def answered(self, gmap: QueryMap, since: float) -> Reply:
-        """The reply of one map; since: `time.monotonic()` when the request came."""
+    def answered(self, gmap: QueryMap) -> Reply:
+        """The reply of one map."""
         gmap = gmap if self.at is None else gmap.at(self.at)
         hits, gone = (
             tuple(ask(self.text, self.top_k, self.min_score, where=self.where, frame=self.frame))
             for ask in (gmap.query, gmap.gone)
         )
-        return Reply(self, hits, **source(gmap, self.frame), seconds=time.monotonic() - since, gone=gone)
+        return Reply(self, hits, **source(gmap, self.frame), gone=gone)
 
 
 @dataclass(frozen=True)
 class Reply:
-    """The answer to a request, computed on the map map_id alone. seconds: from submission to answer. gone: of
-    `QueryMap.gone`. A store's frame and metric are None.
+    """The answer to a request, computed on the map map_id alone. gone: of `QueryMap.gone`. A store's frame and metric
+    are None.
 
-    >>> reply = Request("red mug").answered(perception.load_map("kitchen.gsmap"), time.monotonic())
+    >>> reply = Request("red mug").answered(perception.load_map("kitchen.gsmap"))
     >>> reply.to_json()["present"], reply.frame, reply.metric
     (True, 'map', True)
     """
@@ -158,7 +157,6 @@ class Reply:
     map_id: str
     frame: str
     metric: bool
-    seconds: float
     gone: tuple[Hit, ...] = ()
 
     def to_json(self) -> dict[str, Any]:

@@ -141,7 +141,8 @@ class Viewer:
         if len(ghosts := session.ghosts()):
             points, size = (ghosts * self.scale).astype(np.float32), GHOST_SIZE
             red = STATE_COLORS["removed"]
-            self._overlays.append(scene.add_point_cloud("/map/ghosts", points, red, point_size=size))
+            cloud = scene.add_point_cloud("/map/ghosts", points, red, point_size=size, point_shape="circle")
+            self._overlays.append(cloud)
         for entry in session.editor.instances if self._boxed else ():
             gone = is_removed(entry) and session.mode != "changes"
             if not entry.get("hidden") and not gone and (not lit or entry["id"] in lit):
@@ -149,10 +150,12 @@ class Viewer:
                 points = np.array(box["center"]) + (CORNERS * box["extent"]) @ np.array(box["rotation"])
                 segments = (points[EDGES] * self.scale).astype(np.float32)
                 style = {"thickness": 2, "thickness_units": "screen"}
+                changed = session.mode == "changes" and entry.get("state") in STATE_COLORS
+                name = session.name(entry) + (f", {entry['state']}" if changed else "")
                 color, middle = tuple(instance_palette([number])[0].tolist()), np.array(entry["centroid"]) * self.scale
                 self._overlays += [
                     scene.add_line_segments(f"/map/boxes/{number}", segments, color, **style),
-                    scene.add_label(f"/map/names/{number}", session.name(entry), position=tuple(middle)),
+                    scene.add_label(f"/map/names/{number}", name, position=tuple(middle)),
                 ]
         if len(session.ends) == 2:
             ends = (np.array(session.ends) * self.scale).astype(np.float32)

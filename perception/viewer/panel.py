@@ -9,7 +9,7 @@ from typing import Any, Protocol
 from perception.map.history import date_of, is_removed, last_seen, since, visits_of
 from perception.query.hit import printed_texts
 from perception.report.text import frame_lines
-from perception.viewer.session import MODES, Session
+from perception.viewer.session import LEGEND, MODES, Session
 
 _OF_ADDRESSES = {f"&#{ord(c)};" for c in ".:@"}
 
@@ -70,11 +70,12 @@ class Panel:
         with self.gui.add_folder("Show"):
             modes = MODES if self.session.editor.original.newest_visit else MODES[:-1]
             mode = self.gui.add_dropdown("colours", modes, initial_value=self.session.mode)
+            legend = self.gui.add_markdown(f"*{LEGEND}*", visible=False)
             boxes = self.gui.add_checkbox("boxes and names", False)
             clear = self.gui.add_button("Clear selection")
 
         def choose(_: Any) -> None:
-            self.session.mode = mode.value
+            self.session.mode, legend.visible = mode.value, mode.value == "changes"
             self.viewer.redraw()
 
         mode.on_update(choose)
@@ -102,10 +103,10 @@ class Panel:
                 },
             )
 
-        def rename_it() -> None:
-            editor.rename(session.chosen(), self._name.value)
+        def rename_it(event: Any) -> None:
+            self.viewer.guarded(lambda: editor.rename(session.chosen(), self._name.value), event.client, edited=True)
 
-        form.on_submit(lambda event: self.viewer.guarded(rename_it, event.client, edited=True))
+        form.on_submit(rename_it)
 
     def _actions(self, label: str, actions: dict[str, Callable[[], object]]) -> None:
         """A row of buttons, each an edit."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from perception.geometry import rotations
+from perception.geometry import rotations, transform
 from perception.map.write import Map
 
 PIXEL = 0.0015
@@ -63,9 +63,8 @@ def _weights(gmap: Map, shown: np.ndarray, origin: np.ndarray, direction: np.nda
         return near, np.empty(0)
     side = np.cross(unit, np.eye(3)[np.abs(unit).argmin()])
     axes = np.stack([side, np.cross(unit, side), unit])
-    pose = np.eye(4)
-    pose[:3, :3] = axes / np.linalg.norm(axes, axis=1, keepdims=True)
-    pose[:3, 3] = -pose[:3, :3] @ origin
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    pose = transform(axes, -axes @ origin)
     K = np.array([[1 / PIXEL, 0, 0.5], [0, 1 / PIXEL, 0.5], [0, 0, 1]])
     arrays = (gmap.means[near], gmap.quats[near], gmap.scales[near], gmap.opacities[near], pose[None], K[None])
     means, quats, scales, opacities, camera, lens = (torch.from_numpy(array.astype(np.float32)) for array in arrays)

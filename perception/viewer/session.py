@@ -20,7 +20,8 @@ from perception.viewer.picking import pick, pick_point
 MODES = ("photo", "instances", "parts", "features", "changes")
 """Colours of the Gaussians; the last only in maps of several visits."""
 STATE_COLORS = {"moved": (50, 110, 255), "added": (40, 200, 80), "removed": (235, 60, 50), "unseen": (70, 70, 80)}
-"""Of things by the newest visit; what is unchanged has the colours of the photos."""
+"""Of things by the newest visit, over the colours of the photos, which are those of what is unchanged."""
+LEGEND = "blue: moved · green: new · dark: nobody looked · red points: where a thing stood"
 HIGHLIGHT = np.array([255, 214, 10], np.uint8)
 
 
@@ -175,7 +176,8 @@ class Session:
         colors = paint(self.editor.original, shown, self.mode)
         for entry in self.editor.instances if self.mode == "changes" else ():
             if (color := STATE_COLORS.get(entry.get("state", ""))) is not None:
-                colors[ids == entry["id"]] = color
+                own = ids == entry["id"]
+                colors[own] = (0.4 * colors[own] + 0.6 * np.array(color)).astype(np.uint8)
         if self.part is not None:
             return highlight(colors, parts, [self.part])
         return highlight(colors, ids, self.lit())

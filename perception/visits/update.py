@@ -11,6 +11,7 @@ record     states, confidences and past places of all instances                 
 
 from __future__ import annotations
 
+import time
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -156,7 +157,8 @@ def assembled(visit: Visit, today: Today, described: DescribedInstances, output:
     old = [view for view in gmap.views if isinstance(view, StoredView)]
     views = [*(moved_record(view, gmap.path, output) for view in old), *_views(visit, output)]
     info = {**gmap.info, "visits": visits_with(gmap, run.source, [v.photo for v in views if v.visit == number])}
-    info |= {"quality": quality, "config": run.config.to_json(), "fingerprint": mark, "seconds": dict(run.seconds)}
+    seconds = {**run.seconds, "total": time.monotonic() - run.started}
+    info |= {"quality": quality, "config": run.config.to_json(), "fingerprint": mark, "seconds": seconds}
     info["instances"] = {**info.get("instances", {}), "count": len(instances)}
     info |= {"training": asdict(today.record), "masks": visit.masks}
     return Map(

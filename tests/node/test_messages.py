@@ -36,7 +36,7 @@ def messages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[dict[st
     write_small_map(path, ["red mug", "Kühlschrank"])
     with QueryEngine(path, encoders=encoders, watch=None) as engine:
         full = engine.ask("red mug")
-        empty = Reply(full.request, (), full.map_id, full.frame, full.metric, 0.0)
+        empty = Reply(full.request, (), full.map_id, full.frame, full.metric)
         health = answers.diagnostics("perception", engine.health(), ["two nodes"], STAMP)
         whole = answers.map_cloud(engine.current, 1000, STAMP)
     told = json.dumps(answers.answer_json(full, "4"))
