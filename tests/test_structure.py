@@ -24,6 +24,7 @@ LAYERS = """
     calibration bags frame
     rasterizer masks
     gaussians
+    splats
     language
     instances
     localise
