@@ -19,9 +19,10 @@ from perception.pipeline.checkpoint import frames_folder
 from perception.pipeline.optimise import Optimised, Photos, Run, label_by_tasks, label_photos
 from perception.sfm.options import ReadOptions
 from perception.splats.features import new_features, train_features
+from perception.splats.gravity import direction
 from perception.splats.read import Splat, is_splat, read_splat
 from perception.splats.scene import drawn, splat_scene
-from perception.splats.surface import Surface, surface_of
+from perception.splats.surface import floaters
 from perception.types import Scene, View
 
 BASE_BYTES, BYTES_PER_GAUSSIAN = 1 << 30, 900
@@ -40,19 +41,17 @@ REFUSED = {
 
 @dataclass(frozen=True)
 class SplatInput:
-    """A splat as the input of a run. gaussians: as they are drawn, with hidden ones transparent, on the CPU."""
+    """A splat as the input of a run. gaussians: as they are drawn, on the CPU; hidden [N] bool: rows that are not."""
 
     splat: Splat
-    surface: Surface
+    hidden: np.ndarray
     gaussians: Gaussians
 
     def scene(self, run: Run, output: Path) -> Scene:
         """The posed scene (see `splats.scene`); its renders lie beside the map."""
-        config, folder = run.config, frames_folder(output)
-        options = ReadOptions(run.work / "sfm", config.seed, run.progress, config.photos.strict)
-        cameras = None if config.splat.cameras is None else Path(config.splat.cameras)
-        facts = (self.splat, self.surface, self.gaussians.to(run.device), folder, config.photos.max_side)
-        return splat_scene(run.source, *facts, config.splat.unit is not None, cameras, options)
+        options = ReadOptions(run.work / "sfm", run.config.seed, run.progress, run.config.photos.strict)
+        drawn = self.splat, self.gaussians.to(run.device), self.hidden
+        return splat_scene(*drawn, frames_folder(output), run.config, options)
 
     def optimise(self, run: Run, training: list[View], held_out: list[View], source: MaskSource) -> Optimised:
         """Masks of the views, and features trained on them."""
@@ -79,11 +78,13 @@ def open_splat(source: Path, config: MapConfig) -> SplatInput | None:
         if getattr(getattr(config, group), name) is not None:
             todo = "give the scale with --unit metre, or to the map with `perception scale`" if group == "frame" else ""
             raise InputError(f"{option}: does not go with a finished splat; {todo or 'leave it out'}")
+    if given.up is not None:
+        direction(given.up)
     splat = read_splat(source)
     needed = BASE_BYTES + len(splat) * BYTES_PER_GAUSSIAN
     require_memory(needed, f"{source}: {len(splat)} Gaussians", "crop the scene, or use a machine with more memory")
-    surface = surface_of(splat, given.up)
-    return SplatInput(splat, surface, drawn(splat, surface.hidden, new_features(len(splat), config)))
+    hidden = floaters(splat)
+    return SplatInput(splat, hidden, drawn(splat, hidden, new_features(len(splat), config)))
 
 
 def unchanged(splat: SplatInput | None, arrays: dict[str, Any]) -> dict[str, Any]:

@@ -11,21 +11,23 @@ Views      chosen greedily, of all places and directions, until every voxel that
 from __future__ import annotations
 
 import heapq
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from perception.errors import InputError
 from perception.gaussians.model import Gaussians
-from perception.gaussians.views import expected_depth, render
+from perception.gaussians.views import expected_depth, render, unprojected
 from perception.geometry import sums_by
 from perception.masks.surface import position_in, voxel_keys
 from perception.progress import QUIET, Progress
+from perception.rasterizer.rasterize import rasterizer_for
+from perception.rasterizer.types import Settings
 
 FIVE = 5.0
 """Views that each voxel is to be seen by."""
-MOST_VIEWS = 200
+MOST_VIEWS = 120
 ENOUGH = 2e-4
 """Gain of the next view, as share of all there is to gain, at which no more are chosen."""
 PLACES, SIDE = 240, 48
@@ -34,16 +36,25 @@ PROXY = 150_000
 """Gaussians that panoramas are rendered of; of more, every k-th is taken, enlarged."""
 ASPECT, FOCAL = 0.75, 0.8
 """Of the views: height and focal length, relative to the width."""
-PIXELS = 5.0
-"""Pixels between neighbouring Gaussians in a view that shows all of their detail."""
-VOXEL = 0.04
-"""Side of a voxel relative to the median distance of what the places see: what a ray of a panorama covers there."""
+EPS = 0.01
+"""Blur of a panorama in pixels², the least that the rasterizer knows: the usual .3 makes a fog of small Gaussians."""
+PIXELS, DENSE = 3.0, 4.0
+"""Pixels between neighbouring Gaussians in a view that shows their detail; multiple of the median number of Gaussians
+in a voxel beyond which more of them ask for no more pixels."""
+SEEN = 0.25
+"""Credit of a view for a voxel, 1 with all the pixels wanted, from which the voxel counts as seen by it."""
+VOXEL = 0.06
+"""Side of a voxel relative to the median distance of what the places see: twice what a ray of a panorama covers there.
+Voxels of the surface are those that hold Gaussians: depth alone is nowhere in haze and at edges."""
 INSIDE, ENCLOSED = 0.6, 0.75
 """Share of the directions in which a place of an enclosing scene sees surface; and of the best places' own share."""
-HEIGHTS = (0.25, 0.9)
-"""Heights of places in an enclosing scene, as shares of its own: from above the seats to below the ceiling."""
+HEIGHTS, OPEN = (0.45, 1.3), 0.3
+"""Heights of places in an enclosing scene, as shares of its own: a robot's or a person's eyes; and how much higher than
+the scene places are tried, which a ceiling or a lack of walls rules out."""
 NEAREST = 0.15
 """Least distance between a camera and what it shows, relative to the median distance."""
+EDGE = 1.3
+"""Ratio of the depths around a ray from which two surfaces are seen there."""
 FILLED = 0.5
 """Least share of a view that shows surface."""
 PITCHES, YAWS = (-75, -50, -28, -8, 15), 12
@@ -58,13 +69,39 @@ class Chosen:
 
 
 @dataclass(frozen=True)
-class _Panorama:
-    """From a place [3], of all rays: the voxel that each hits [R] int64, −1 = none, and its distance [R]."""
+class Panorama:
+    """What a place [3] sees along rays in all directions [R]: points [R, 3] in the world, distance [R], hit [R] bool,
+    and normals [R, 3] of what is hit, towards the place; 0 at edges."""
 
     place: np.ndarray
     points: np.ndarray
     distance: np.ndarray
     hit: np.ndarray
+    normals: np.ndarray
+
+
+@dataclass(frozen=True)
+class Survey:
+    """The places of a scene. inside: it encloses them. typical: median distance of what they see. keys [V]: voxels of
+    side `size` that they see, ascending; numbers: of each place, the voxel of each ray [R], −1 = none. rays [R, 3]:
+    directions in the world, and of each the share of the places in free space from which it hits nothing."""
+
+    places: list[Panorama]
+    inside: bool
+    typical: float
+    size: float
+    keys: np.ndarray
+    numbers: list[np.ndarray]
+    rays: np.ndarray
+    open_rays: np.ndarray
+
+    def normals(self) -> np.ndarray:
+        """[V, 3] mean normal of each voxel, shorter than 1 where it is not flat."""
+        voxel = np.concatenate(self.numbers)
+        rows = np.flatnonzero(voxel >= 0)
+        normals = np.concatenate([place.normals for place in self.places])[rows]
+        sums = sums_by(voxel[rows], normals, len(self.keys))
+        return np.asarray(sums / np.maximum(np.bincount(voxel[rows], minlength=len(self.keys)), 1)[:, None])
 
 
 def intrinsics(width: int) -> tuple[np.ndarray, int]:
@@ -88,47 +125,69 @@ def proxy_of(gaussians: Gaussians, hidden: np.ndarray) -> Gaussians:
     )
 
 
+def survey(proxy: Gaussians, means: np.ndarray, axes: np.ndarray, progress: Progress = QUIET) -> Survey:
+    """The places of a scene from which it is seen. means [N, 3]: of the Gaussians that count; proxy: what is rendered;
+    axes [3, 3]: rows of the frame of the grid, the last one up. InputError where nothing is seen."""
+    low, high = _box(means @ axes.T)
+    above = np.array([0, 0, OPEN * (high[2] - low[2])])
+    places = [p for p in _panoramas(proxy, _grid(low, high + above, PLACES) @ axes, axes, progress) if p.hit.any()]
+    typical = float(np.median(np.concatenate([p.distance[p.hit] for p in places]))) if places else 0.0
+    places = [p for p in places if np.quantile(p.distance[p.hit], 0.02) > NEAREST * typical]
+    enclosed = np.array([p.hit.mean() for p in places])
+    best = float(np.quantile(enclosed, 0.9)) if len(places) else 0.0
+    inside = best >= INSIDE
+    opened = 1 - np.mean([p.hit for p in places], axis=0) if places else np.zeros(6 * SIDE * SIDE)
+    if inside:
+        places = [p for p, share in zip(places, enclosed, strict=True) if share >= ENCLOSED * best]
+        opened = 1 - np.mean([p.hit for p in places], axis=0)
+    else:
+        places = [p for p in _panoramas(proxy, _around(low, high) @ axes, axes, progress) if p.hit.any()]
+    if not places:
+        raise InputError("the scene is one blob: nothing in it is seen from anywhere; give --cameras, or another scene")
+    typical = float(np.median(np.concatenate([p.distance[p.hit] for p in places])))
+    keys = np.unique(voxel_keys(means, VOXEL * typical))
+    numbers = [np.where(p.hit, position_in(keys, voxel_keys(p.points, VOXEL * typical)), -1) for p in places]
+    every = np.concatenate(numbers)
+    seen = np.unique(every[every >= 0])
+    if not len(seen):
+        raise InputError("the scene is one blob: none of its Gaussians are seen as a surface; give another scene")
+    numbers = [np.where(n >= 0, position_in(seen, n), -1) for n in numbers]
+    return Survey(places, inside, typical, VOXEL * typical, keys[seen], numbers, _rays() @ axes, opened)
+
+
 def choose_views(
-    proxy: Gaussians,
-    means: np.ndarray,
-    up: np.ndarray,
-    width: int,
-    given: np.ndarray,
-    given_focal: float,
-    progress: Progress = QUIET,
+    found: Survey, proxy: Gaussians, means: np.ndarray, up: np.ndarray, width: int, given: np.ndarray, focal: float
 ) -> Chosen:
-    """Views of the scene: means [N, 3] of the Gaussians that count, `proxy` what is rendered. given [G, 4, 4]: poses
-    that are used anyway, as cameras of `given_focal` (focal length over width). InputError where nothing is seen."""
+    """Virtual views, `width` pixels wide, of the places in `found`. given [G, 4, 4]: poses that are used anyway, of
+    cameras of a focal length of `focal` widths. InputError where no view shows enough."""
     axes = upright_axes(up)
-    places, inside = _places(proxy, means, axes, progress)
-    distances = np.concatenate([p.distance[p.hit] for p in places])
-    typical = float(np.median(distances))
-    size = VOXEL * typical
-    keys, numbers = _numbered(places, size)
-    counts = np.bincount(p[p >= 0], minlength=len(keys)) if len(p := position_in(keys, voxel_keys(means, size))) else 0
+    counts = np.zeros(len(found.keys))
+    voxel = position_in(found.keys, voxel_keys(means, found.size))
+    counts += np.bincount(voxel[voxel >= 0], minlength=len(counts))
     per_ray = (FOCAL * width * 2 / SIDE) ** 2  # pixels of a view that a ray of a panorama covers, at its axis
-    wanted = np.maximum(PIXELS**2 * np.maximum(counts, 1) / per_ray, 1.0)  # rays
-    weight = np.sqrt(1.0 + counts)
-    have = np.zeros(len(keys))
+    usual = np.median(counts[counts > 0]) if counts.any() else 1.0
+    wanted = np.maximum(PIXELS**2 * np.clip(counts, 1, DENSE * usual) / per_ray, 1.0)  # rays
+    credits = []
     for pose in given:
-        voxel = position_in(keys, voxel_keys(_seen_from(proxy, pose, given_focal)[0], size))
+        voxel = position_in(found.keys, voxel_keys(_seen_from(proxy, pose, focal), found.size))
         seen, rays = np.unique(voxel[voxel >= 0], return_counts=True)
-        have[seen] += np.minimum(1, rays * (given_focal / FOCAL) ** 2 / wanted[seen])
-    views, credits = _candidates(places, numbers, axes, wanted, NEAREST * typical)
-    if not views:
-        raise InputError("no place was found from which the scene is seen; give --cameras")
-    order, have = _greedy(credits, weight, have)
-    full = weight[have >= FIVE - 0.5].sum() / weight.sum()
-    poses = np.stack([views[i] for i in order]) if order else np.zeros((0, 4, 4))
+        credits.append((seen, np.minimum(1, rays / wanted[seen])))
+    poses, more = _candidates(_at_height(found, means, axes), axes, wanted, NEAREST * found.typical)
+    if not poses and not len(given):
+        raise InputError("no view was found that shows enough of the scene; give --cameras")
+    order = _greedy(more, np.sqrt(1.0 + counts), credits)
+    times = np.zeros(len(counts))
+    for seen, credit in [*credits, *(more[i] for i in order)]:
+        times[seen] += credit >= SEEN
     facts: dict[str, float | int | str] = {
-        "places": len(places),
-        "kind": "inside" if inside else "around",
+        "kind": "inside" if found.inside else "around",
+        "places": len(found.places),
         "views": len(order),
-        "seen_by_five": round(float(full), 4),
-        "voxel": size,
-        "median_distance": typical,
+        "seen_by_five": round(float(np.mean(times >= FIVE)), 4),
+        "seen": round(float(np.mean(times >= 1)), 4),
+        "median_distance": found.typical,
     }
-    return Chosen(poses, facts)
+    return Chosen(np.array([poses[i] for i in order]).reshape(-1, 4, 4), facts)
 
 
 def upright_axes(up: np.ndarray) -> np.ndarray:
@@ -152,32 +211,20 @@ def pose_at(place: np.ndarray, yaw: float, pitch: float, axes: np.ndarray) -> np
 # ----------------------------------------------------------------------- places
 
 
-def _places(proxy: Gaussians, means: np.ndarray, axes: np.ndarray, progress: Progress) -> tuple[list[_Panorama], bool]:
-    """Panoramas of the places that are used, and whether the scene encloses them."""
-    local = means @ axes.T
+def _box(local: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of the box of means [N, 3] without far backgrounds: of a uniform scene it holds all."""
     low, high = np.quantile(local, [0.1, 0.9], axis=0)
     margin = 0.5 * (high - low)
-    # Of a uniform scene this is more than all; far backgrounds stay out.
-    low, high = np.maximum(low - margin, local.min(axis=0)), np.minimum(high + margin, local.max(axis=0))
-    grid = _grid(low, high, PLACES) @ axes
-    free = [p for p in _panoramas(proxy, grid, axes, progress) if p.hit.any()]
-    if not free:
-        raise InputError("the scene is one blob: nothing is seen from anywhere in it; give --cameras, or another scene")
-    typical = float(np.median(np.concatenate([p.distance[p.hit] for p in free])))
-    free = [p for p in free if np.quantile(p.distance[p.hit], 0.02) > NEAREST * typical]
-    enclosed = np.array([p.hit.mean() for p in free])
-    best = float(np.quantile(enclosed, 0.9)) if len(free) else 0.0
-    if best >= INSIDE:
-        height = np.array([(axes[2] @ p.place - low[2]) / (high[2] - low[2]) for p in free])
-        good = (enclosed >= ENCLOSED * best) & (height >= HEIGHTS[0]) & (height <= HEIGHTS[1])
-        chosen = [p for p, is_good in zip(free, good, strict=True) if is_good]
-        if chosen:
-            return chosen, True
-    around = _around(low, high) @ axes
-    free = [p for p in _panoramas(proxy, around, axes, progress) if p.hit.any()]
-    if not free:
-        raise InputError("the scene is one blob: nothing is seen from around it; give --cameras, or another scene")
-    return free, False
+    return np.maximum(low - margin, local.min(axis=0)), np.minimum(high + margin, local.max(axis=0))
+
+
+def _at_height(found: Survey, means: np.ndarray, axes: np.ndarray) -> list[tuple[Panorama, np.ndarray]]:
+    """The places, in an enclosing scene those of HEIGHTS, each with the voxels of its rays."""
+    pairs = list(zip(found.places, found.numbers, strict=True))
+    low, high = (corner[2] for corner in _box(means @ axes.T))
+    height = [(axes[2] @ place.place - low) / max(high - low, 1e-12) for place in found.places]
+    good = [pair for pair, at in zip(pairs, height, strict=True) if HEIGHTS[0] <= at <= HEIGHTS[1]]
+    return good if found.inside and good else pairs
 
 
 def _grid(low: np.ndarray, high: np.ndarray, count: int) -> np.ndarray:
@@ -210,58 +257,66 @@ def _rays() -> np.ndarray:
     centre = (np.arange(SIDE) + 0.5) / SIDE * 2 - 1
     x, y = np.meshgrid(centre, centre)
     face = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
-    return np.concatenate([face @ turn for turn in _faces()])
+    return np.asarray((face @ _faces()).reshape(-1, 3))
 
 
-def _faces() -> list[np.ndarray]:
-    """Rotations camera_from_level [3, 3] of the six faces."""
+def _faces() -> np.ndarray:
+    """Rotations camera_from_level [6, 3, 3] of the faces."""
     level = [pose_at(np.zeros(3), yaw, 0.0, np.eye(3))[:3, :3] for yaw in np.radians([0, 90, 180, 270])]
-    return [*level, *(pose_at(np.zeros(3), 0.0, pitch, np.eye(3))[:3, :3] for pitch in np.radians([90, -90]))]
+    return np.stack([*level, *(pose_at(np.zeros(3), 0.0, pitch, np.eye(3))[:3, :3] for pitch in np.radians([90, -90]))])
 
 
-def _panoramas(proxy: Gaussians, places: np.ndarray, axes: np.ndarray, progress: Progress) -> list[_Panorama]:
+def _panoramas(proxy: Gaussians, places: np.ndarray, axes: np.ndarray, progress: Progress) -> list[Panorama]:
     K = torch.tensor([[SIDE / 2, 0, SIDE / 2], [0, SIDE / 2, SIDE / 2], [0, 0, 1.0]])
+    settings = Settings(SIDE, SIDE, eps2d=EPS, variance=False, depth=True)
     rays, faces, found = _rays() @ axes, _faces(), []
+    fixed = replace(proxy.inputs(torch.eye(4), K), Ks=K.expand(6, 3, 3).contiguous().to(proxy.means.device))
     lengths = np.linalg.norm(rays, axis=1)
     for done, place in enumerate(places, start=1):
-        depths = []
-        for face in faces:
-            pose = np.eye(4)
-            pose[:3, :3] = face @ axes
-            pose[:3, 3] = -pose[:3, :3] @ place
-            depths.append(expected_depth(render(proxy, torch.from_numpy(pose).float(), K, SIDE, SIDE)).numpy().ravel())
-        depth = np.concatenate(depths).astype(np.float64)
-        found.append(_Panorama(place, place + depth[:, None] * rays, depth * lengths, depth > 0))
+        poses = np.tile(np.eye(4), (6, 1, 1))
+        poses[:, :3, :3] = faces @ axes
+        poses[:, :3, 3] = -poses[:, :3, :3] @ place
+        inputs = replace(fixed, viewmats=torch.from_numpy(poses).float().to(proxy.means.device))
+        out = rasterizer_for(proxy.means.device).rasterize_forward(inputs, settings)
+        depth = expected_depth(out, all_views=True).numpy().ravel().astype(np.float64)
+        points = place + depth[:, None] * rays
+        found.append(Panorama(place, points, depth * lengths, depth > 0, _normals(points, depth, place)))
         progress.update("places", done, len(places))
     return found
 
 
-def _seen_from(proxy: Gaussians, pose: np.ndarray, focal: float) -> tuple[np.ndarray, float]:
-    """World points [P, 3] that a given camera sees, one for each ray of a panorama's size, and the share of its rays
-    that see surface."""
-    width = round(SIDE / 2 / focal * focal * 2 * ASPECT) or SIDE
-    K = np.array([[focal * width, 0, width / 2], [0, focal * width, width * ASPECT / 2], [0, 0, 1.0]])
-    shape = (width, round(width * ASPECT))
-    out = render(proxy, torch.from_numpy(pose).float(), torch.from_numpy(K).float(), *shape)
+def _normals(points: np.ndarray, depth: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """[R, 3] float32 unit normals towards `place`, from neighbouring rays; 0 where one of them hits nothing, or
+    another surface."""
+    grid, depths = points.reshape(6, SIDE, SIDE, 3), depth.reshape(6, SIDE, SIDE)
+    normals = np.zeros_like(grid)
+    right, down = grid[:, 1:-1, 2:] - grid[:, 1:-1, :-2], grid[:, 2:, 1:-1] - grid[:, :-2, 1:-1]
+    cross = np.cross(right, down)
+    cross /= np.maximum(np.linalg.norm(cross, axis=-1, keepdims=True), 1e-300)
+    cross *= -np.sign((cross * (grid[:, 1:-1, 1:-1] - place)).sum(axis=-1, keepdims=True))
+    four = np.stack([depths[:, 1:-1, 2:], depths[:, 1:-1, :-2], depths[:, 2:, 1:-1], depths[:, :-2, 1:-1]])
+    smooth = (four.min(axis=0) > 0) & (four.max(axis=0) < EDGE * four.min(axis=0))
+    normals[:, 1:-1, 1:-1] = np.where(smooth[..., None], cross, 0)
+    return np.asarray(normals.reshape(-1, 3).astype(np.float32))
+
+
+def _seen_from(proxy: Gaussians, pose: np.ndarray, focal: float) -> np.ndarray:
+    """World points [P, 3] that a given camera sees, along rays as dense as those of a panorama at its axis."""
+    width = max(2, round(SIDE / 2 / focal))
+    height = round(ASPECT * width)
+    K = np.array([[SIDE / 2, 0, width / 2], [0, SIDE / 2, height / 2], [0, 0, 1.0]])
+    tensors = torch.from_numpy(pose).float(), torch.from_numpy(K).float()
+    out = render(proxy, *tensors, width, height, eps2d=EPS)
     depth = expected_depth(out).numpy().astype(np.float64)
     y, x = np.nonzero(depth > 0)
-    rays = np.stack([(x + 0.5 - K[0, 2]) / K[0, 0], (y + 0.5 - K[1, 2]) / K[1, 1], np.ones(len(x))], axis=1)
-    return (rays * depth[y, x][:, None] - pose[:3, 3]) @ pose[:3, :3], float((depth > 0).mean())
+    return unprojected(K, pose, x + 0.5, y + 0.5, depth[y, x])
 
 
 # ----------------------------------------------------------------------- choice
 
 
-def _numbered(places: list[_Panorama], size: float) -> tuple[np.ndarray, list[np.ndarray]]:
-    """The voxels [V] that the places see, ascending, and of each place the voxel [R] of each ray, −1 = none."""
-    found = [np.where(p.hit, voxel_keys(p.points, size), -1) for p in places]
-    keys = np.unique(np.concatenate([np.unique(each) for each in found]))
-    keys = keys[keys >= 0]
-    return keys, [np.where(each >= 0, np.searchsorted(keys, np.maximum(each, 0)), -1) for each in found]
-
-
 def _candidates(
-    places: list[_Panorama], numbers: list[np.ndarray], axes: np.ndarray, wanted: np.ndarray, nearest: float
+    places: list[tuple[Panorama, np.ndarray]], axes: np.ndarray, wanted: np.ndarray, nearest: float
 ) -> tuple[list[np.ndarray], list[tuple[np.ndarray, np.ndarray]]]:
     """Poses of all views that show enough, and of each the voxels that it sees with its credit for each, up to 1."""
     rays = _rays()
@@ -275,7 +330,7 @@ def _candidates(
             turns.append((yaw, pitch))
             inside.append((rows, share[rows] * (np.linalg.norm(rays[rows], axis=1) / z[rows]) ** 3))
     poses, credits = [], []
-    for place, number in zip(places, numbers, strict=True):
+    for place, number in places:
         for (yaw, pitch), (rows, pixels) in zip(turns, inside, strict=True):
             hit = place.hit[rows]
             if hit.mean() < FILLED or np.quantile(place.distance[rows][hit], 0.02) < nearest:
@@ -288,29 +343,28 @@ def _candidates(
 
 
 def _greedy(
-    credits: list[tuple[np.ndarray, np.ndarray]], weight: np.ndarray, have: np.ndarray
-) -> tuple[list[int], np.ndarray]:
-    """Views in the order of choice, and what each voxel then has. Gains only fall, so most are not computed again."""
+    views: list[tuple[np.ndarray, np.ndarray]], weight: np.ndarray, given: list[tuple[np.ndarray, np.ndarray]]
+) -> list[int]:
+    """Views in the order of choice, beside those `given`; each as voxels and its credit for them. weight [V]: of
+    voxels. Gains only fall, so those of most views need not be computed again."""
+    have = np.zeros(len(weight))
+    for seen, credit in given:
+        have[seen] += credit
 
     def gain(view: int) -> float:
-        seen, credit = credits[view]
+        seen, credit = views[view]
         return float((weight[seen] * np.minimum(credit, np.maximum(FIVE - have[seen], 0))).sum())
 
-    queue = [(-gain(view), view) for view in range(len(credits))]
+    queue = [(-gain(view), view) for view in range(len(views))]
     heapq.heapify(queue)
     order: list[int] = []
     least = ENOUGH * FIVE * float(weight.sum())
-    while queue and len(order) < MOST_VIEWS:
-        _, view = heapq.heappop(queue)
+    while queue and len(order) < MOST_VIEWS and -queue[0][0] >= least:
+        view = heapq.heappop(queue)[1]
         now = gain(view)
-        if now < least:
-            if not queue or -queue[0][0] < least:
-                break
-            continue
         if queue and now < -queue[0][0]:
             heapq.heappush(queue, (-now, view))
-            continue
-        order.append(view)
-        seen, credit = credits[view]
-        have[seen] += credit
-    return order, have
+        elif now >= least:
+            order.append(view)
+            have[views[view][0]] += views[view][1]
+    return order

@@ -22,6 +22,7 @@ from perception.io.documents import brief
 from perception.io.ply import Element, map_ply, ply_tables, read_ply
 from perception.splats.spz import read_spz
 
+NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
 SUFFIXES = (".ply", ".spz")
 LEAST_ROWS = 64
 """Gaussians that a scene needs: fewer are one blob, or nothing that instances could be found in."""
@@ -55,7 +56,7 @@ class Splat:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The five arrays by name."""
-        return {name: getattr(self, name) for name in ("means", "quats", "log_scales", "opacity_logits", "sh")}
+        return {name: getattr(self, name) for name in NAMES}
 
 
 def is_splat(source: Path) -> bool:
@@ -67,7 +68,9 @@ def read_splat(path: Path) -> Splat:
     """The Gaussians of a file, row for row. InputError for a mesh, a cloud of points, too few Gaussians, an unknown
     version, and a damaged file."""
     if path.suffix.lower() == ".spz":
-        splat = Splat(**read_spz(path))
+        stored = read_spz(path)
+        means, quats, log_scales, logits, sh = (stored[name] for name in NAMES)
+        splat = Splat(means, quats, log_scales, logits, sh)
     else:
         rows = _ply_rows(path)
         splat = _compressed(rows) if "packed_position" in rows else _plain(path, rows)

@@ -11,7 +11,9 @@ import numpy as np
 import torch
 
 from perception.colors import rgb8_from_sh
+from perception.config import MapConfig
 from perception.errors import InputError
+from perception.frame.gravity import Gravity
 from perception.gaussians.model import Gaussians
 from perception.gaussians.views import expected_depth, psnr, render
 from perception.inputs.readers import reader_of
@@ -19,9 +21,10 @@ from perception.inputs.transforms import read_frames
 from perception.photos.decode import load_photo, scaled_K
 from perception.photos.views import make_view
 from perception.sfm.options import ReadOptions
-from perception.splats.cameras import FOCAL, choose_views, intrinsics, proxy_of
+from perception.splats.cameras import FOCAL, choose_views, intrinsics, proxy_of, survey, upright_axes
+from perception.splats.gravity import direction, gravity_of
 from perception.splats.read import Splat
-from perception.splats.surface import Surface, hide, sampled
+from perception.splats.surface import hide, sampled
 from perception.types import DepthImage, Scene, View
 
 WIDTH = 640
@@ -50,42 +53,53 @@ def drawn(splat: Splat, hidden: np.ndarray, features: torch.Tensor) -> Gaussians
 
 
 def splat_scene(
-    source: Path, splat: Splat, surface: Surface, gaussians: Gaussians, folder: Path, side: int, metric: bool,
-    cameras: Path | None, options: ReadOptions,
-) -> Scene:  # fmt: skip
-    """Views of the scene in the splat's own frame: those of `cameras` first, then virtual ones. Renders and depth are
-    written to `folder`. InputError for cameras that see nothing of the scene."""
-    folder.mkdir(parents=True, exist_ok=True)
-    width = min(WIDTH, side)
-    means = splat.means[~surface.hidden].astype(np.float64)
-    points, colors = _cloud(splat, surface.hidden)
+    splat: Splat, gaussians: Gaussians, hidden: np.ndarray, folder: Path, config: MapConfig, options: ReadOptions
+) -> Scene:
+    """Views of the scene in the splat's own frame: those of `splat.cameras` first, then virtual ones. gaussians: as
+    they are drawn. Renders and depth are written to `folder`. InputError for cameras that see nothing of the scene."""
+    side, cameras = config.photos.max_side, None if config.splat.cameras is None else Path(config.splat.cameras)
+    means = splat.means[~hidden].astype(np.float64)
+    points, colors = _cloud(splat, hidden)
     given, notes = ([], []) if cameras is None else _given(cameras, replace(options, cloud=(points, colors)))
     given, warnings = _with_renders(given, gaussians, folder, side, cameras)
-    proxy = proxy_of(gaussians, surface.hidden)
+    up = None if config.splat.up is None else direction(config.splat.up)
+    proxy = proxy_of(gaussians, hidden)
+    found = survey(proxy, means, upright_axes(np.array([0.0, 0.0, 1.0]) if up is None else up), options.progress)
+    if up is None:
+        gravity = gravity_of(found.normals(), sampled(means, POINTS), found.open_rays, found.rays)
+    else:
+        gravity = Gravity(-up, 0.0, f"--up {config.splat.up}")
     poses = np.array([view.camera_from_world for view in given]).reshape(-1, 4, 4)
     focal = float(np.median([view.K[0, 0] / view.width for view in given])) if given else FOCAL
-    chosen = choose_views(proxy, means, surface.up, width, poses, focal, options.progress)
-    K, height = intrinsics(width)
-    views = list(given)
-    for number, pose in enumerate(chosen.poses):
-        view = View(f"virtual/{number:03d}.png", folder / f"virtual/{number:03d}.png", K, width, height, pose)
-        views.append(_written(view, rendered(gaussians, pose, K, width, height), folder))
-    hidden = int((surface.hidden & ~splat.parked).sum())
-    facts = {"gaussians": len(splat), "not_finite": int(splat.parked.sum()), "hidden": hidden, **chosen.facts}
+    width = min(WIDTH, side)
+    chosen = choose_views(found, proxy, means, -gravity.direction, width, poses, focal)
+    views = given + _virtual(chosen.poses, gaussians, width, folder)
+    parked = int(splat.parked.sum())
+    facts = {"gaussians": len(splat), "not_finite": parked, "hidden": int(hidden.sum()) - parked, **chosen.facts}
     facts["given_views"] = len(given)
     report: dict[str, Any] = {
         "input": "splat",
-        "gravity": surface.gravity.to_json(),
+        "gravity": gravity.to_json(),
         "splat": facts,
-        "notes": [*splat.notes, *notes, _told(source, facts)],
+        "notes": [*splat.notes, *notes, _told(facts)],
         "warnings": warnings,
         "left_out": [],
         "mean_reprojection_error_px": None,
         "seconds": {},
     }
+    metric = config.splat.unit is not None
     if metric:
         report["scale"] = {"metres_per_unit": 1.0, "source": "--unit metre", "standard_error": None}
     return Scene(sorted(views, key=lambda view: view.name), points, colors, metric, report=report)
+
+
+def _virtual(poses: np.ndarray, gaussians: Gaussians, width: int, folder: Path) -> list[View]:
+    (K, height), views = intrinsics(width), []
+    for number, pose in enumerate(poses):
+        name = f"virtual/{number:03d}.png"
+        view = View(name, folder / name, K, width, height, pose)
+        views.append(_written(view, rendered(gaussians, pose, K, width, height), folder))
+    return views
 
 
 def rendered(gaussians: Gaussians, pose: np.ndarray, K: np.ndarray, width: int, height: int) -> Rendered:
@@ -101,11 +115,10 @@ def _cloud(splat: Splat, hidden: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return splat.means[rows].astype(np.float64), rgb8_from_sh(splat.sh[rows, 0])
 
 
-def _told(source: Path, facts: dict[str, Any]) -> str:
+def _told(facts: dict[str, Any]) -> str:
+    given = f"{facts['given_views']} given and " if facts["given_views"] else ""
     seen = f"{facts['seen_by_five']:.0%} of the surface that can be seen is seen by five or more"
-    views = f"{facts['given_views']} given and {facts['views']} virtual views" if facts["given_views"] else ""
-    views = views or f"{facts['views']} virtual views"
-    return f"{source}: {facts['gaussians']} Gaussians, {facts['hidden']} hidden as floaters; {views}, {seen}"
+    return f"{facts['hidden']} Gaussians are hidden as floaters; {given}{facts['views']} virtual views: {seen}"
 
 
 def _given(cameras: Path, options: ReadOptions) -> tuple[list[View], list[str]]:
