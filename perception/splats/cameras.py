@@ -12,11 +12,13 @@ from __future__ import annotations
 
 import heapq
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 import torch
 
 from perception.errors import InputError
+from perception.frame.gravity import Gravity
 from perception.gaussians.model import Gaussians
 from perception.gaussians.views import expected_depth, render, unprojected
 from perception.geometry import sums_by
@@ -24,6 +26,7 @@ from perception.masks.surface import position_in, voxel_keys
 from perception.progress import QUIET, Progress
 from perception.rasterizer.rasterize import rasterizer_for
 from perception.rasterizer.types import Settings
+from perception.splats.gravity import gravity_of
 
 FIVE = 5.0
 """Views that each voxel is to be seen by."""
@@ -49,8 +52,10 @@ Voxels of the surface are those that hold Gaussians: depth alone is nowhere in h
 INSIDE, ENCLOSED = 0.6, 0.75
 """Share of the directions in which a place of an enclosing scene sees surface; and of the best places' own share."""
 HEIGHTS, OPEN = (0.45, 1.3), 0.3
-"""Heights of places in an enclosing scene, as shares of its own: a robot's or a person's eyes; and how much higher than
-the scene places are tried, which a ceiling or a lack of walls rules out."""
+"""Heights of places in an enclosing scene, as shares of its own: a robot's or a person's eyes; and how much beyond the
+scene places are tried, which a ceiling or a lack of walls rules out."""
+HORIZON = np.sin(np.radians(15))
+"""Sine of the elevation below which a place of an enclosing scene sees surface: it may be open above."""
 NEAREST = 0.15
 """Least distance between a camera and what it shows, relative to the median distance."""
 EDGE = 1.3
@@ -82,26 +87,20 @@ class Panorama:
 
 @dataclass(frozen=True)
 class Survey:
-    """The places of a scene. inside: it encloses them. typical: median distance of what they see. keys [V]: voxels of
-    side `size` that they see, ascending; numbers: of each place, the voxel of each ray [R], −1 = none. rays [R, 3]:
-    directions in the world, and of each the share of the places in free space from which it hits nothing."""
+    """The places of a scene. numbers: of each, the voxel of each ray [R], −1 = none; rays [R, 3]: their
+    directions in the world. inside: the scene encloses them.
+    typical: median distance of what they see. keys [V]: voxels of side `size` that they see, ascending; counts [V]: the
+    Gaussians in each."""
 
     places: list[Panorama]
+    numbers: list[np.ndarray]
+    rays: np.ndarray
     inside: bool
+    gravity: Gravity
     typical: float
     size: float
     keys: np.ndarray
-    numbers: list[np.ndarray]
-    rays: np.ndarray
-    open_rays: np.ndarray
-
-    def normals(self) -> np.ndarray:
-        """[V, 3] mean normal of each voxel, shorter than 1 where it is not flat."""
-        voxel = np.concatenate(self.numbers)
-        rows = np.flatnonzero(voxel >= 0)
-        normals = np.concatenate([place.normals for place in self.places])[rows]
-        sums = sums_by(voxel[rows], normals, len(self.keys))
-        return np.asarray(sums / np.maximum(np.bincount(voxel[rows], minlength=len(self.keys)), 1)[:, None])
+    counts: np.ndarray
 
 
 def intrinsics(width: int) -> tuple[np.ndarray, int]:
@@ -125,57 +124,88 @@ def proxy_of(gaussians: Gaussians, hidden: np.ndarray) -> Gaussians:
     )
 
 
-def survey(proxy: Gaussians, means: np.ndarray, axes: np.ndarray, progress: Progress = QUIET) -> Survey:
+def survey(proxy: Gaussians, means: np.ndarray, up: np.ndarray | None, progress: Progress = QUIET) -> Survey:
     """The places of a scene from which it is seen. means [N, 3]: of the Gaussians that count; proxy: what is rendered;
-    axes [3, 3]: rows of the frame of the grid, the last one up. InputError where nothing is seen."""
+    up [3]: None finds it (see `gravity_of`). InputError where nothing is seen."""
+    axes = upright_axes(np.array([0.0, 0.0, 1.0]) if up is None else up)
     low, high = _box(means @ axes.T)
-    above = np.array([0, 0, OPEN * (high[2] - low[2])])
-    places = [p for p in _panoramas(proxy, _grid(low, high + above, PLACES) @ axes, axes, progress) if p.hit.any()]
-    typical = float(np.median(np.concatenate([p.distance[p.hit] for p in places]))) if places else 0.0
-    places = [p for p in places if np.quantile(p.distance[p.hit], 0.02) > NEAREST * typical]
-    enclosed = np.array([p.hit.mean() for p in places])
-    best = float(np.quantile(enclosed, 0.9)) if len(places) else 0.0
-    inside = best >= INSIDE
-    opened = 1 - np.mean([p.hit for p in places], axis=0) if places else np.zeros(6 * SIDE * SIDE)
-    if inside:
-        places = [p for p, share in zip(places, enclosed, strict=True) if share >= ENCLOSED * best]
-        opened = 1 - np.mean([p.hit for p in places], axis=0)
-    else:
-        places = [p for p in _panoramas(proxy, _around(low, high) @ axes, axes, progress) if p.hit.any()]
+    side = OPEN * (high - low).min()  # whichever way is up
+    places = _panoramas(proxy, _grid(low - side, high + side, PLACES) @ axes, axes, progress)
+    places = [p for p in places if p.hit.any()]
     if not places:
         raise InputError("the scene is one blob: nothing in it is seen from anywhere; give --cameras, or another scene")
-    typical = float(np.median(np.concatenate([p.distance[p.hit] for p in places])))
-    keys = np.unique(voxel_keys(means, VOXEL * typical))
-    numbers = [np.where(p.hit, position_in(keys, voxel_keys(p.points, VOXEL * typical)), -1) for p in places]
+    typical = _typical(places)
+    places = [p for p in places if np.quantile(p.distance[p.hit], 0.02) > NEAREST * typical] or places
+    rays = _rays() @ axes
+    if up is None:
+        shares = np.array([p.hit.mean() for p in places])
+        inner = [p for p, share in zip(places, shares, strict=True) if share >= ENCLOSED * np.quantile(shares, 0.9)]
+        opened = 1 - np.mean([p.hit for p in inner], axis=0)
+        gravity = gravity_of(_normals_of(inner, means, VOXEL * typical), means, opened, rays)
+    else:
+        gravity = Gravity(-up, 0.0, "--up")
+    places, inside = _well_placed(places, means, -gravity.direction, rays)
+    if not inside:
+        axes = upright_axes(-gravity.direction)
+        rays = _rays() @ axes
+        around = _around(*_box(means @ axes.T)) @ axes
+        places = [p for p in _panoramas(proxy, around, axes, progress) if p.hit.any()] or places
+    typical = _typical(places)
+    size = VOXEL * typical
+    keys, counts = np.unique(voxel_keys(means, size), return_counts=True)
+    numbers = [np.where(p.hit, position_in(keys, voxel_keys(p.points, size)), -1) for p in places]
     every = np.concatenate(numbers)
     seen = np.unique(every[every >= 0])
     if not len(seen):
         raise InputError("the scene is one blob: none of its Gaussians are seen as a surface; give another scene")
     numbers = [np.where(n >= 0, position_in(seen, n), -1) for n in numbers]
-    return Survey(places, inside, typical, VOXEL * typical, keys[seen], numbers, _rays() @ axes, opened)
+    return Survey(places, numbers, rays, inside, gravity, typical, size, keys[seen], counts[seen])
 
 
-def choose_views(
-    found: Survey, proxy: Gaussians, means: np.ndarray, up: np.ndarray, width: int, given: np.ndarray, focal: float
-) -> Chosen:
+def _well_placed(
+    places: list[Panorama], means: np.ndarray, up: np.ndarray, rays: np.ndarray
+) -> tuple[list[Panorama], bool]:
+    """The places that an enclosing scene encloses, at good height; all and False where there are none."""
+    low, high = (corner[0] for corner in _box((means @ up)[:, None]))
+    height = np.array([(up @ p.place - low) / max(high - low, 1e-12) for p in places])
+    below = rays @ up < HORIZON * np.linalg.norm(rays, axis=1)
+    enclosed = np.array([p.hit[below].mean() for p in places])
+    good = (height >= HEIGHTS[0]) & (height <= HEIGHTS[1])
+    best = float(np.quantile(enclosed[good], 0.9)) if good.any() else 0.0
+    good &= enclosed >= ENCLOSED * best
+    return (list(compress(places, good)), True) if best >= INSIDE else (places, False)
+
+
+def _typical(places: list[Panorama]) -> float:
+    """The median distance of what places see."""
+    return float(np.median(np.concatenate([p.distance[p.hit] for p in places])))
+
+
+def _normals_of(places: list[Panorama], means: np.ndarray, size: float) -> np.ndarray:
+    """[V, 3] mean normal of each voxel of side `size` that holds means and is seen, shorter than 1 where not flat."""
+    points, normals = (np.concatenate([getattr(p, name)[p.hit] for p in places]) for name in ("points", "normals"))
+    keys = np.unique(voxel_keys(means, size))
+    voxel = position_in(keys, voxel_keys(points, size))
+    rows = np.flatnonzero(voxel >= 0)
+    counts = np.maximum(np.bincount(voxel[rows], minlength=len(keys)), 1)
+    return np.asarray(sums_by(voxel[rows], normals[rows], len(keys)) / counts[:, None])
+
+
+def choose_views(found: Survey, proxy: Gaussians, width: int, given: np.ndarray, focal: float) -> Chosen:
     """Virtual views, `width` pixels wide, of the places in `found`. given [G, 4, 4]: poses that are used anyway, of
     cameras of a focal length of `focal` widths. InputError where no view shows enough."""
-    axes = upright_axes(up)
-    counts = np.zeros(len(found.keys))
-    voxel = position_in(found.keys, voxel_keys(means, found.size))
-    counts += np.bincount(voxel[voxel >= 0], minlength=len(counts))
+    axes, counts = upright_axes(-found.gravity.direction), found.counts
     per_ray = (FOCAL * width * 2 / SIDE) ** 2  # pixels of a view that a ray of a panorama covers, at its axis
-    usual = np.median(counts[counts > 0]) if counts.any() else 1.0
-    wanted = np.maximum(PIXELS**2 * np.clip(counts, 1, DENSE * usual) / per_ray, 1.0)  # rays
+    wanted = np.maximum(PIXELS**2 * np.minimum(counts, DENSE * np.median(counts)) / per_ray, 1.0)  # rays
     credits = []
     for pose in given:
         voxel = position_in(found.keys, voxel_keys(_seen_from(proxy, pose, focal), found.size))
         seen, rays = np.unique(voxel[voxel >= 0], return_counts=True)
         credits.append((seen, np.minimum(1, rays / wanted[seen])))
-    poses, more = _candidates(_at_height(found, means, axes), axes, wanted, NEAREST * found.typical)
+    poses, more = _candidates(found, axes, wanted, NEAREST * found.typical)
     if not poses and not len(given):
         raise InputError("no view was found that shows enough of the scene; give --cameras")
-    order = _greedy(more, np.sqrt(1.0 + counts), credits)
+    order = _greedy(more, counts.astype(np.float64), credits)
     times = np.zeros(len(counts))
     for seen, credit in [*credits, *(more[i] for i in order)]:
         times[seen] += credit >= SEEN
@@ -183,8 +213,8 @@ def choose_views(
         "kind": "inside" if found.inside else "around",
         "places": len(found.places),
         "views": len(order),
-        "seen_by_five": round(float(np.mean(times >= FIVE)), 4),
-        "seen": round(float(np.mean(times >= 1)), 4),
+        "seen_by_five": round(float(counts[times >= FIVE].sum() / counts.sum()), 4),
+        "seen": round(float(counts[times >= 1].sum() / counts.sum()), 4),
         "median_distance": found.typical,
     }
     return Chosen(np.array([poses[i] for i in order]).reshape(-1, 4, 4), facts)
@@ -216,15 +246,6 @@ def _box(local: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     low, high = np.quantile(local, [0.1, 0.9], axis=0)
     margin = 0.5 * (high - low)
     return np.maximum(low - margin, local.min(axis=0)), np.minimum(high + margin, local.max(axis=0))
-
-
-def _at_height(found: Survey, means: np.ndarray, axes: np.ndarray) -> list[tuple[Panorama, np.ndarray]]:
-    """The places, in an enclosing scene those of HEIGHTS, each with the voxels of its rays."""
-    pairs = list(zip(found.places, found.numbers, strict=True))
-    low, high = (corner[2] for corner in _box(means @ axes.T))
-    height = [(axes[2] @ place.place - low) / max(high - low, 1e-12) for place in found.places]
-    good = [pair for pair, at in zip(pairs, height, strict=True) if HEIGHTS[0] <= at <= HEIGHTS[1]]
-    return good if found.inside and good else pairs
 
 
 def _grid(low: np.ndarray, high: np.ndarray, count: int) -> np.ndarray:
@@ -316,10 +337,10 @@ def _seen_from(proxy: Gaussians, pose: np.ndarray, focal: float) -> np.ndarray:
 
 
 def _candidates(
-    places: list[tuple[Panorama, np.ndarray]], axes: np.ndarray, wanted: np.ndarray, nearest: float
+    found: Survey, axes: np.ndarray, wanted: np.ndarray, nearest: float
 ) -> tuple[list[np.ndarray], list[tuple[np.ndarray, np.ndarray]]]:
     """Poses of all views that show enough, and of each the voxels that it sees with its credit for each, up to 1."""
-    rays = _rays()
+    rays = found.rays @ axes.T
     # A ray near a face's corner covers less of the sphere than one at its middle, as a view's pixel does near its own.
     share = 1 / np.linalg.norm(rays, axis=1) ** 3
     turns, inside = [], []
@@ -330,13 +351,14 @@ def _candidates(
             turns.append((yaw, pitch))
             inside.append((rows, share[rows] * (np.linalg.norm(rays[rows], axis=1) / z[rows]) ** 3))
     poses, credits = [], []
-    for place, number in places:
+    for place, number in zip(found.places, found.numbers, strict=True):
         for (yaw, pitch), (rows, pixels) in zip(turns, inside, strict=True):
             hit = place.hit[rows]
             if hit.mean() < FILLED or np.quantile(place.distance[rows][hit], 0.02) < nearest:
                 continue
-            seen, index = np.unique(number[rows][hit], return_inverse=True)
-            covered = sums_by(index, pixels[hit][:, None], len(seen))[:, 0]
+            own = number[rows] >= 0
+            seen, index = np.unique(number[rows][own], return_inverse=True)
+            covered = sums_by(index, pixels[own][:, None], len(seen))[:, 0]
             poses.append(pose_at(place.place, yaw, pitch, axes))
             credits.append((seen, np.minimum(1, covered / wanted[seen])))
     return poses, credits

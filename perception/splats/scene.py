@@ -13,7 +13,6 @@ import torch
 from perception.colors import rgb8_from_sh
 from perception.config import MapConfig
 from perception.errors import InputError
-from perception.frame.gravity import Gravity
 from perception.gaussians.model import Gaussians
 from perception.gaussians.views import expected_depth, psnr, render
 from perception.inputs.readers import reader_of
@@ -21,8 +20,8 @@ from perception.inputs.transforms import read_frames
 from perception.photos.decode import load_photo, scaled_K
 from perception.photos.views import make_view
 from perception.sfm.options import ReadOptions
-from perception.splats.cameras import FOCAL, choose_views, intrinsics, proxy_of, survey, upright_axes
-from perception.splats.gravity import direction, gravity_of
+from perception.splats.cameras import FOCAL, choose_views, intrinsics, proxy_of, survey
+from perception.splats.gravity import direction
 from perception.splats.read import Splat
 from perception.splats.surface import hide, sampled
 from perception.types import DepthImage, Scene, View
@@ -64,22 +63,18 @@ def splat_scene(
     given, warnings = _with_renders(given, gaussians, folder, side, cameras)
     up = None if config.splat.up is None else direction(config.splat.up)
     proxy = proxy_of(gaussians, hidden)
-    found = survey(proxy, means, upright_axes(np.array([0.0, 0.0, 1.0]) if up is None else up), options.progress)
-    if up is None:
-        gravity = gravity_of(found.normals(), sampled(means, POINTS), found.open_rays, found.rays)
-    else:
-        gravity = Gravity(-up, 0.0, f"--up {config.splat.up}")
+    found = survey(proxy, means, up, options.progress)
     poses = np.array([view.camera_from_world for view in given]).reshape(-1, 4, 4)
     focal = float(np.median([view.K[0, 0] / view.width for view in given])) if given else FOCAL
     width = min(WIDTH, side)
-    chosen = choose_views(found, proxy, means, -gravity.direction, width, poses, focal)
+    chosen = choose_views(found, proxy, width, poses, focal)
     views = given + _virtual(chosen.poses, gaussians, width, folder)
     parked = int(splat.parked.sum())
     facts = {"gaussians": len(splat), "not_finite": parked, "hidden": int(hidden.sum()) - parked, **chosen.facts}
     facts["given_views"] = len(given)
     report: dict[str, Any] = {
         "input": "splat",
-        "gravity": gravity.to_json(),
+        "gravity": found.gravity.to_json(),
         "splat": facts,
         "notes": [*splat.notes, *notes, _told(facts)],
         "warnings": warnings,
