@@ -11,12 +11,14 @@ LEVEL = np.cos(np.radians(12))
 """Cosine of the angle up to which a surface is parallel to a plane."""
 FLAT = 8
 """Power of the mean normal's length with which a voxel counts: 0.6 of one whose normals are off by 20°."""
-LOWER = 0.3
-"""Weight of where the Gaussians lie against which way the surfaces face; chosen so that a room's ceiling, which faces
-down as much as its floor faces up, leaves the choice to the furniture."""
+LOWER, WALLS = 0.3, 0.06
+"""Weight of where things stand against the open side; share of the scene's extent, at each end of its main directions,
+that is left out of them as walls, floor and ceiling."""
+USUAL, NEAR = 0.1, np.cos(np.radians(15))
+"""Evidence for a direction near one that files have up, and the cosine of the angle that is near."""
 CONE = np.cos(np.radians(40))
 """Cosine of the angle around a direction in which rays are counted that see nothing."""
-GUESSED, FOUND, LEAST = 20.0, 2.0, 0.05
+GUESSED, FOUND, LEAST = 20.0, 2.0, 0.12
 """Standard error in degrees of a direction taken from the file's convention, and of one found; its least evidence."""
 
 
@@ -39,20 +41,27 @@ def gravity_of(normals: np.ndarray, means: np.ndarray, open_rays: np.ndarray, ra
     space from which they are seen; means [N, 3]: of the Gaussians; open_rays [R]: share of the places from which the
     ray of direction rays [R, 3] hits nothing. Candidates are the normals of the main planes.
 
-    A candidate u has the evidence O + F + LOWER A: O the share of open rays within CONE of u, less that around −u; F
-    the share of the surface that faces u, less the share that faces −u; A the share of the Gaussians in the lower half
-    of the heights, less one half. Nobody takes photos of the sky, nor many of a ceiling; floors, tables and seats are
-    seen from above, and walls face each other; things stand on floors, and ceilings are bare.
+    A candidate u has the evidence O + LOWER A + U: O the share of open rays within CONE of u, less that around −u; A
+    the share of the Gaussians between the walls that lie in the lower half of the heights, less one half; U is USUAL
+    for one of the directions that files have up. Nobody takes photos of the sky, nor many of a ceiling; and things
+    stand on floors.
     """
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     convention = np.array([0.0, -1.0, 0.0])
     length = np.linalg.norm(normals, axis=1)
-    flatness = length**FLAT
-    unit = normals / np.maximum(length, 1e-300)[:, None]
     found = [(0.0, convention)]
-    for plane in planes(unit, flatness):
-        opened = float(open_rays[rays @ plane > CONE].mean() - open_rays[rays @ plane < -CONE].mean())
-        found += [(sign * opened + evidence(sign * plane, unit, flatness, means), sign * plane) for sign in (1, -1)]
+    main = planes(normals / np.maximum(length, 1e-300)[:, None], length**FLAT)
+    inner = np.ones(len(means), bool)
+    for plane in main[:3]:
+        low, high = np.quantile(means @ plane, [0.01, 0.99])
+        inner &= np.abs(means @ plane - (low + high) / 2) < (0.5 - WALLS) * (high - low)
+    things = means[inner] if inner.mean() > 0.02 else means
+    for up in (sign * plane for plane in main for sign in (1.0, -1.0)):
+        opened = float(open_rays[rays @ up > CONE].mean() - open_rays[rays @ up < -CONE].mean())
+        low, high = np.quantile(means @ up, [0.01, 0.99])
+        lower = float(np.mean(things @ up < (low + high) / 2)) - 0.5
+        usual = USUAL if max(-up[1], up[1], up[2]) > NEAR else 0.0
+        found.append((opened + LOWER * lower + usual, up))
     best, up = max(found, key=lambda each: each[0])
     if best < LEAST:
         return Gravity(-convention, GUESSED, "the usual axes of such files, as none was found; --up gives it")
@@ -76,12 +85,3 @@ def planes(normals: np.ndarray, areas: np.ndarray, most: int = 6) -> list[np.nda
         found.append(start)
         left[np.abs(normals @ start) > LEVEL] = 0
     return found
-
-
-def evidence(up: np.ndarray, unit: np.ndarray, flatness: np.ndarray, means: np.ndarray) -> float:
-    """F + LOWER A of `gravity_of`; unit [V, 3] normals of length 1, flatness [V] in [0, 1]."""
-    cosine = unit @ up
-    faces = float((flatness * np.sign(cosine) * (np.abs(cosine) > LEVEL)).sum() / max(float(flatness.sum()), 1e-300))
-    height = means @ up
-    low, high = np.quantile(height, [0.02, 0.98])
-    return faces + LOWER * (float(np.mean(height < (low + high) / 2)) - 0.5)
