@@ -74,6 +74,12 @@ class FrameConfig(Settings):
     board: str | None = Field(None, description="KIND:COLSxROWS:SQUARE[:MARKER[:DICTIONARY]]: a board in the photos")
 
 
+class SplatConfig(Settings):
+    cameras: str | None = Field(None, description="of a finished splat: COLMAP model or transforms.json, used first")
+    up: str | None = Field(None, description="of a finished splat: z, -y, ... or X,Y,Z; none: as its floor lies")
+    unit: Literal["metre"] | None = Field(None, description="of a finished splat, where it is known")
+
+
 class SamConfig(Settings):
     points_per_side: int = Field(32, ge=1, le=256, description="side of the grid of point prompts")
     skip_covered: bool = Field(
@@ -161,6 +167,7 @@ class MapConfig(Settings):
     sam: SamConfig = SamConfig()
     photos: PhotoConfig = PhotoConfig()
     frame: FrameConfig = FrameConfig()
+    splat: SplatConfig = SplatConfig()
     train: TrainConfig = TrainConfig()
     densify: DensifyConfig = DensifyConfig()
     losses: LossConfig = LossConfig()

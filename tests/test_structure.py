@@ -26,6 +26,7 @@ LAYERS = """
     calibration bags frame
     rasterizer masks
     gaussians
+    splats
     language
     instances
     localise

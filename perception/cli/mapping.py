@@ -56,7 +56,7 @@ def register(commands: Any) -> None:
 
 
 def _add_map(commands: Any) -> None:
-    p = command(commands, "map", _map, "build a map of photos, a video, a COLMAP workspace, a transforms.json or RGB-D")
+    p = command(commands, "map", _map, "build a map of photos, a video, posed photos, RGB-D or a finished splat")
     p.formatter_class, p.late_epilog = argparse.RawDescriptionHelpFormatter, _settings
     p.add_argument("input", type=Path, metavar="INPUT")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="MAP")
@@ -104,6 +104,9 @@ _SHORTCUTS = {
     "frame.known_length": ("TEXT", '"0.297: a.jpg 100,200 300,220; b.jpg 110,190 310,215"'),
     "frame.tag_size": ("M", "side of the AprilTags or ArUco markers in the photos"),
     "frame.board": ("TEXT", "a calibration board in the photos, such as charuco:8x11:0.02"),
+    "splat.cameras": ("MODEL", "of a finished splat: COLMAP model or transforms.json, used first"),
+    "splat.up": ("AXIS", "of a finished splat: z, -y, ... or X,Y,Z"),
+    "splat.unit": ("UNIT", "of a finished splat: metre"),
     "photos.max_side": ("PX", "long side in pixels at which the map is trained"),
     "train.budget": ("N", "most Gaussians the map may have"),
     "train.iterations": ("N", None),

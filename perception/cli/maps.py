@@ -48,6 +48,10 @@ def register(commands: Any) -> None:
     p.add_argument("--instance", type=int, metavar="ID", help="--mesh: the closed body of this one instead")
     p.add_argument("--voxels", type=Path, metavar="OUT.npz", help="free, occupied and unknown space; distances")
     p.add_argument("--voxel-size", type=float, metavar="S", help="of --mesh and --voxels, in map units")
+    p.add_argument("--splat", type=Path, metavar="OUT.ply", help="the Gaussians as they are, with their instance_id")
+    p.add_argument("--only", type=int, nargs="+", default=[], metavar="ID", help="--splat: these instances alone")
+    p.add_argument("--without", type=int, nargs="+", default=[], metavar="ID", help="--splat: all but these instances")
+    p.add_argument("--each", action="store_true", help="--splat: one file for each instance, OUT-ID.ply")
     p.add_argument("--graph", type=Path, metavar="OUT.json", help="rooms, supports, things, parts and their relations")
 
     p = map_command(commands, "render", _render, "pictures of the map from given cameras")
@@ -172,8 +176,11 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.export.export_map import ExportOptions, export_map, side_file
     from perception.map.outputs import check_side_file, refuse_inputs
 
-    if args.output is None and args.mesh is None and args.voxels is None and args.graph is None:
-        raise InputError("export: nothing to write; give -o OUT, --mesh OUT, --voxels OUT.npz or --graph OUT.json")
+    if all(file is None for file in (args.output, args.mesh, args.voxels, args.graph, args.splat)):
+        outputs = "-o OUT, --mesh OUT, --splat OUT.ply, --voxels OUT.npz or --graph OUT.json"
+        raise InputError(f"export: nothing to write; give {outputs}")
+    if args.splat is None and (args.only or args.without or args.each):
+        raise InputError("export: --only, --without and --each choose what --splat writes; give --splat OUT.ply")
     if args.output is None and args.points is not None:
         raise InputError("export: --points labels a cloud; give the file to write it to with -o")
     if args.instance is not None and args.mesh is None:
@@ -184,11 +191,17 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         check_outputs(args.mesh, args.voxels, args.voxel_size)
     side = None if args.output is None else side_file(args.output)
     inputs = [args.map, args.points, args.transform, args.segments]
-    refuse_inputs([args.output, side, args.mesh, args.voxels, args.graph], inputs)
+    refuse_inputs([args.output, side, args.mesh, args.voxels, args.graph, args.splat], inputs)
     if side is not None:
         check_side_file(side, args.output, "instances")
     facts: dict[str, Any] = {}
     lines = []
+    if args.splat is not None:
+        from perception.export.splat import export_splat
+
+        splat, text = export_splat(args.map, args.splat, args.only, args.without, args.each)
+        facts |= splat
+        lines.append(text)
     if args.graph is not None:
         from perception.query import load_map
         from perception.query.scene_graph import write_graph

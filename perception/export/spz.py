@@ -17,13 +17,11 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.atomic import atomic_file
 from perception.map.map import Map
+from perception.splats.spz import COLOR_SCALE, FLIPS, HEADER, MAGIC
 
-MAGIC, VERSION = 0x5053474E, 2
-COLOR_SCALE = 0.15
+VERSION = 2
 FIRST_BITS, REST_BITS = 5, 4
 """Bits that are kept of harmonics of degree 1, and of higher ones; fewer compress better."""
-FLIPS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
-"""Signs of the harmonics of degrees 1 to 3 when y and z change sign."""
 
 
 def write_spz(path: Path, gmap: Map) -> None:
@@ -60,7 +58,7 @@ def spz_bytes(gmap: Map, path: Path = Path("map.spz")) -> bytes:
         _bytes(127.5 * quats[:, 1:] * [1, -1, -1] + 127.5),
         _harmonics(gmap.sh[:, 1:]),
     ]
-    header = struct.pack("<IIIBBBB", MAGIC, VERSION, count, degree, bits, 0, 0)
+    header = struct.pack(HEADER, MAGIC, VERSION, count, degree, bits, 0, 0)
     return gzip.compress(header + b"".join(column.tobytes() for column in columns), 6, mtime=0)
 
 

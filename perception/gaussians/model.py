@@ -79,7 +79,7 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        return math.isqrt(self.sh.shape[1]) - 1
+        return min(3, math.isqrt(self.sh.shape[1]) - 1)  # the rasterizer's highest
 
     @property
     def base_colors(self) -> torch.Tensor:

@@ -168,11 +168,11 @@ def depth_image(
     return expected_depth(render(gaussians, camera_from_world, K, width, height))
 
 
-def expected_depth(out: Forward) -> torch.Tensor:
-    """`depth_image` of what `render` returned."""
+def expected_depth(out: Forward, all_views: bool = False) -> torch.Tensor:
+    """`depth_image` of what `render` returned; all_views: of all cameras [C, H, W]."""
     assert out.depths is not None  # for the type checker
-    alpha = out.alphas[0]
-    return torch.where(alpha > 0.5, out.depths[0] / alpha.clamp(min=1e-6), torch.zeros_like(alpha)).cpu()
+    alpha, depths = (out.alphas, out.depths) if all_views else (out.alphas[0], out.depths[0])
+    return torch.where(alpha > 0.5, depths / alpha.clamp(min=1e-6), torch.zeros_like(alpha)).cpu()
 
 
 def surface_depth(gaussians: Gaussians, view: TrainingView) -> np.ndarray:

@@ -116,6 +116,11 @@ def _reconstructed(folder: Path, options: ReadOptions) -> Scene:
     return reconstruct(folder, replace(options, lens=lens))
 
 
+def _refuse_splat(source: Path, options: ReadOptions) -> Scene:
+    """A splat has no photos to read: `pipeline.splats` renders some."""
+    raise InputError(f"{source}: is a finished splat, which `perception map` reads; photos are needed here")
+
+
 READERS = (
     Reader("video", _is_video, _video_sizes, lambda source: [source], _read_video, poses=False, cameras=False),
     Reader(
@@ -154,10 +159,19 @@ READERS = (
         poses=False,
         cameras=False,
     ),
+    Reader(
+        "splat",
+        lambda source: source.suffix.lower() in (".ply", ".spz") and source.is_file(),
+        lambda source: PhotoSizes([], "no photos"),
+        lambda source: [source],
+        _refuse_splat,
+        poses=False,
+        cameras=False,
+    ),
 )
 EXPECTED = (
-    "a folder of photos, a video, a COLMAP workspace, a transforms.json or an RGB-D recording (TUM, ScanNet, 7-Scenes, "
-    "3DMatch, Redwood)"
+    "a folder of photos, a video, a COLMAP workspace, a transforms.json, an RGB-D recording (TUM, ScanNet, 7-Scenes, "
+    "3DMatch, Redwood) or a finished splat (.ply, .spz)"
 )
 UNREAD = (
     *("*.nvm", "bundle*.out", "cameras.xml", "cameras.sfm", "sfm_data.json", "poses_bounds.npy", "reconstruction.json"),

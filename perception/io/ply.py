@@ -81,6 +81,15 @@ def read_ply(path: str | Path) -> dict[str, Element]:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); expected a PLY file") from error
 
 
+def ply_tables(path: Path) -> list[Table]:
+    """The elements that the header of a PLY file lists."""
+    try:
+        with path.open("rb") as file:
+            return _read_header(file, path)[1]
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); expected a PLY file") from error
+
+
 def read_body(path: Path, file: BinaryIO, order: str, tables: list[Table]) -> dict[str, Element]:
     """The tables that follow a header, as `read_ply` returns them. order: of bytes, "<" or ">"; "" for text."""
     try:

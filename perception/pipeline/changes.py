@@ -62,6 +62,9 @@ def _named(source: Path, config: MapConfig, frames: Path) -> Iterator[tuple[str,
     yield "input", source, input_files(source)
     if source.is_file() and frames.is_dir():
         yield "frames", frames, list_photos(frames)
+    if config.splat.cameras is not None:
+        cameras = Path(config.splat.cameras).absolute()
+        yield "splat.cameras", cameras, input_files(cameras)
     for setting in ("camera", "init_points", "held_out"):
         if name := getattr(photos, setting):
             file = Path(name).absolute()

@@ -38,6 +38,7 @@ from perception.machine import peak_memory_mib
 from perception.map.replace import writing
 from perception.photos.video import FRAMES_RECORD
 from perception.progress import Progress
+from perception.splats.read import is_splat
 
 CHECKPOINT = "checkpoint.pt"
 BEFORE_MASKS = "before_masks.pt"
@@ -59,7 +60,8 @@ def poses_mark(source: Path, config: MapConfig) -> str:
     """Hash of the input path and the settings that change the poses and the sparse cloud."""
     photos = config.photos
     masks = (photos.ignore_masks, photos.ignore_still)
-    chosen = (photos.camera, photos.strict, photos.poses, *masks, photos.init_points)
+    chosen: tuple[Any, ...] = (photos.camera, photos.strict, photos.poses, *masks, photos.init_points)
+    chosen += (config.splat.model_dump(), config.photos.max_side) if is_splat(source) else ()
     return digest(os.path.realpath(source), *chosen, config.frame.model_dump(), config.seed)
 
 

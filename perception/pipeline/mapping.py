@@ -9,8 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from perception.config import MapConfig
 from perception.errors import InputError
 from perception.frame.recentre import recentred
@@ -34,6 +32,7 @@ from perception.pipeline.estimate import log_estimate
 from perception.pipeline.instances import DescribedInstances, describe, group_gaussians
 from perception.pipeline.optimise import Optimised, Run
 from perception.pipeline.record import finite, run_record, scored
+from perception.pipeline.splats import SplatInput, open_splat, unchanged
 from perception.progress import QUIET, Progress
 from perception.report.text import depth_text, frame_lines
 from perception.sfm.options import ReadOptions
@@ -68,13 +67,18 @@ def build_map(
         hold_inputs(work, source, config, output)
         run = _open_run(source, config, work, progress, engine)
         masks, encoder, reader = _open_models(run)
+        splat = open_splat(source, config)
 
         # Posed images I_v (§3.2) and a sparse cloud.
-        scene = _posed_scene(output, run)
-        scene, training, held_out = split_scene(scene, config.photos)
+        scene = _posed_scene(output, run, splat)
+        photos = config.photos if splat is None else config.photos.model_copy(update={"holdout": 0})
+        scene, training, held_out = split_scene(scene, photos)
 
         # Masks M_v,i of every photo (§3.2), and Gaussians optimised on photos and masks (§3.1 to 3.2.3).
-        optimised = optimiser(scene, config.train.block_photos)(run, scene, training, held_out, masks)
+        if splat is None:
+            optimised = optimiser(scene, config.train.block_photos)(run, scene, training, held_out, masks)
+        else:  # Gaussians as they are, and features alone
+            optimised = splat.optimise(run, training, held_out, masks)
         segments = load_segmentation(run.masks) if masks.needs_depth else None
         del masks  # with its images
 
@@ -82,7 +86,7 @@ def build_map(
         with run.stage("instances"):
             grouped = group_gaussians(optimised, run, segments)
             described = describe(optimised, grouped, run, encoder, reader)
-        gmap = _assemble(run, scene, optimised, described, output)
+        gmap = _assemble(run, scene, optimised, described, output, splat)
         write_map(output, gmap, fresh=True)
     _log_result(gmap, output, progress)
     return gmap
@@ -123,13 +127,15 @@ def _open_models(run: Run) -> tuple[MaskSource, Encoder | None, TextReader | Non
     return masks, encoder, make_reader(config.language.texts)
 
 
-def _posed_scene(output: Path, run: Run) -> Scene:
+def _posed_scene(output: Path, run: Run, splat: SplatInput | None) -> Scene:
     """The scene of the input in the map's frame: read from the work folder, or made and kept there."""
     source, config, work, progress = run.source, run.config, run.work, run.progress
     kept = work / f"poses-{poses_mark(source, config)}"
     with run.stage("poses"):
         scene = load_saved_scene(kept)
-        if scene is None:
+        if scene is None and splat is not None:
+            save_scene(kept, scene := splat.scene(run, output))
+        elif scene is None:
             log_estimate(source, config, progress.log)
             photos = config.photos
             files = (photos.ignore_masks, photos.camera, photos.init_points)
@@ -146,14 +152,20 @@ def _posed_scene(output: Path, run: Run) -> Scene:
     return scene
 
 
-def _assemble(run: Run, scene: Scene, optimised: Optimised, described: DescribedInstances, output: Path) -> Map:
+def _assemble(
+    run: Run,
+    scene: Scene,
+    optimised: Optimised,
+    described: DescribedInstances,
+    output: Path,
+    splat: SplatInput | None,
+) -> Map:
     """The map to write, scored in its held-out views; in JSON values, None replaces NaN and infinity."""
     gaussians, quality = scored(run, optimised, scene.metric)
     held = {view.name: view for view in optimised.photos.held_out}
     arrays: dict[str, Any] = {name: tensor.detach().numpy() for name, tensor in gaussians.named().items()}
-    arrays["quats"] = arrays["quats"] / np.maximum(np.linalg.norm(arrays["quats"], axis=1, keepdims=True), 1e-12)
     return Map(
-        **arrays,
+        **unchanged(splat, arrays),
         instance_ids=described.ids,
         membership=described.membership,
         instances=finite(described.instances),

@@ -1,0 +1,1 @@
+"""Finished Gaussian scenes of other tools as inputs of `map`: read, looked at by virtual cameras, and given back."""

@@ -1,0 +1,97 @@
+"""Floaters, up, and virtual cameras of a room whose surfaces, free space and gravity are known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from perception.errors import InputError
+from perception.geometry import camera_centres
+from perception.splats.cameras import FIVE, Chosen, Survey, choose_views, proxy_of, survey
+from perception.splats.gravity import direction
+from perception.splats.read import Splat, read_splat
+from perception.splats.scene import drawn, rendered
+from perception.splats.surface import floaters
+from support.splat_rooms import SIDES, TABLE, room_columns, write_room
+
+TURNS = {
+    "z up": np.eye(3),
+    "y down": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    "tilted": Rotation.from_rotvec([0.4, -0.9, 0.3]).as_matrix(),
+}
+
+
+def looked(splat: Splat, hidden: np.ndarray, up: np.ndarray | None = None) -> tuple[Survey, Chosen]:
+    gaussians = drawn(splat, hidden, torch.zeros(len(splat), 1))
+    proxy = proxy_of(gaussians, hidden)
+    found = survey(proxy, splat.means[~hidden].astype(np.float64), up)
+    return found, choose_views(found, proxy, 320, np.zeros((0, 4, 4)), 0.8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ceiling", [False, True])
+@pytest.mark.parametrize("name", TURNS)
+def test_cameras_stand_in_the_room_and_see_it_all(tmp_path: Path, name: str, ceiling: bool) -> None:
+    turn = TURNS[name]
+    columns, thing = room_columns(turn, ceiling=ceiling)
+    splat = read_splat(write_room(tmp_path / "room.ply", columns))
+    found, chosen = looked(splat, floaters(splat))
+    angle = np.degrees(np.arccos(np.clip(-found.gravity.direction @ turn[:, 2], -1, 1)))
+    assert angle < 4  # of a voxel over a wall
+    centres = camera_centres(chosen.poses) @ turn
+    assert np.all((centres[:, :2] > 0) & (centres[:, :2] < SIDES[:2]))  # between the walls
+    assert np.all(centres[:, 2] > 0.9)
+    on_table = np.all((centres > TABLE[0]) & (centres < TABLE[1]), axis=1)
+    assert not on_table.any()
+    level = chosen.poses[:, 0, :3] @ turn[:, 2]
+    assert np.abs(level).max() < np.sin(np.radians(4))
+    # Each Gaussian of the boxes is seen by FIVE, by an oracle without voxels: nothing lies nearer on its ray.
+    K = np.array([[256.0, 0, 160], [0, 256.0, 120], [0, 0, 1]])
+    gaussians = drawn(splat, splat.parked, torch.zeros(len(splat), 1))
+    means, times = splat.means[thing >= 2].astype(np.float64), np.zeros((thing >= 2).sum())
+    for pose in chosen.poses:
+        depth = rendered(gaussians, pose, K, 320, 240).depth
+        x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).T
+        u, v = (K[0, 0] * x / z + 160).astype(int), (K[1, 1] * y / z + 120).astype(int)
+        inside = (z > 0) & (u >= 0) & (v >= 0) & (u < 320) & (v < 240)
+        near = np.abs(depth[np.where(inside, v, 0), np.where(inside, u, 0)] - z) < 0.06
+        times += inside & near
+    assert np.mean(times >= FIVE) > 0.9
+
+
+def test_the_choice_is_the_same_twice(tmp_path: Path) -> None:
+    columns, _ = room_columns()
+    splat = read_splat(write_room(tmp_path / "room.ply", columns))
+    first, second = (looked(splat, floaters(splat), np.array([0.0, 0, 1]))[1] for _ in range(2))
+    assert np.array_equal(first.poses, second.poses)
+    assert first.facts == second.facts
+
+
+def test_floaters_and_haze_are_told_and_nothing_else(tmp_path: Path) -> None:
+    columns, thing = room_columns(floaters=12)
+    splat = read_splat(write_room(tmp_path / "room.ply", columns))
+    hidden = floaters(splat)
+    assert hidden[thing == -1].mean() > 0.9  # of random places one may touch the table
+    assert not hidden[thing >= 0].any()
+
+
+def test_up_is_read(tmp_path: Path) -> None:
+    assert np.array_equal(direction("-y"), [0, -1, 0])
+    assert np.allclose(direction("0, -3,4"), [0, -0.6, 0.8])
+    for text in ("w", "1,2", "0,0,0", "nan,0,1", ""):
+        with pytest.raises(InputError, match=r"--up: found"):
+            direction(text)
+
+
+def test_one_blob_is_told(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    columns, _ = room_columns()
+    count = len(columns["x"])
+    fog = {name: rng.normal(size=count).astype(np.float32) for name in "xyz"} | {"opacity": np.full(count, -6.0, "f4")}
+    splat = read_splat(write_room(tmp_path / "fog.ply", {**columns, **fog}))
+    with pytest.raises(InputError, match="one blob"):
+        looked(splat, splat.parked)

@@ -1,0 +1,199 @@
+"""Finished splats as tools write them: every coding read to the same Gaussians, and what is none told in one line."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plyfile import PlyData, PlyElement
+
+from perception.errors import InputError
+from perception.splats.read import read_splat
+from perception.splats.spz import MAGIC
+
+COUNT = 300
+STANDARD = ("x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
+
+
+def columns(degree: int = 1, seed: int = 0) -> dict[str, np.ndarray]:
+    """The properties of 3DGS by name, in its order."""
+    rng = np.random.default_rng(seed)
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{i}" for i in range(3 * ((degree + 1) ** 2 - 1))] + list(STANDARD[3:])
+    values = {name: rng.normal(size=COUNT).astype(np.float32) for name in names}
+    for i in range(3):
+        values[f"scale_{i}"] = rng.uniform(-5, -3, COUNT).astype(np.float32)
+    return values
+
+
+def write(path: Path, values: dict[str, np.ndarray], text: bool = False, order: str = "<") -> Path:
+    """By plyfile, which is not the writer under test."""
+    rows = np.empty(len(next(iter(values.values()))), [(name, array.dtype.str) for name, array in values.items()])
+    for name, array in values.items():
+        rows[name] = array
+    PlyData([PlyElement.describe(rows, "vertex")], text=text, byte_order=order).write(str(path))
+    return path
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
+def test_all_degrees_are_read_bit_for_bit(tmp_path: Path, degree: int) -> None:
+    values = columns(degree)
+    splat = read_splat(write(tmp_path / "a.ply", values))
+    assert np.array_equal(splat.means, np.stack([values[n] for n in "xyz"], axis=1))
+    assert np.array_equal(splat.opacity_logits, values["opacity"])
+    assert np.array_equal(splat.log_scales[:, 1], values["scale_1"])
+    assert np.array_equal(splat.quats[:, 3], values["rot_3"])
+    size = (degree + 1) ** 2 - 1
+    for channel in range(3):
+        assert np.array_equal(splat.sh[:, 0, channel], values[f"f_dc_{channel}"])
+        for k in range(size):
+            assert np.array_equal(splat.sh[:, 1 + k, channel], values[f"f_rest_{channel * size + k}"])
+
+
+@pytest.mark.parametrize(("text", "order"), [(True, "="), (False, ">")])
+def test_texts_and_the_other_byte_order(tmp_path: Path, text: bool, order: str) -> None:
+    values = columns()
+    splat = read_splat(write(tmp_path / "a.ply", values, text, order))
+    assert np.allclose(splat.means[:, 2], values["z"], rtol=1e-6)
+
+
+def changed(**change: Callable[[dict[str, np.ndarray]], np.ndarray | None]) -> dict[str, np.ndarray]:
+    values = columns(0)
+    for name, function in change.items():
+        new = function(values)
+        if new is None:
+            values.pop(name, None)
+        else:
+            values[name] = new
+    return values
+
+
+def test_values_that_are_activated_already(tmp_path: Path) -> None:
+    plain = columns(0)
+    scales = {f"scale_{i}": (lambda v, i=i: np.exp(v[f"scale_{i}"])) for i in range(3)}
+    values = changed(opacity=lambda v: 1 / (1 + np.exp(-v["opacity"])), **scales)
+    splat = read_splat(write(tmp_path / "a.ply", values))
+    assert np.allclose(splat.opacity_logits, plain["opacity"], atol=1e-5)
+    assert np.allclose(splat.log_scales[:, 2], plain["scale_2"], atol=1e-5)
+    assert len(splat.notes) == 2
+
+
+def test_large_units_do_not_make_logarithms_lengths(tmp_path: Path) -> None:
+    """A scene in millimetres has positive logarithms."""
+    values = changed(**{name: (lambda v, n=name: v[n] * 1000) for name in "xyz"})
+    values |= {f"scale_{i}": values[f"scale_{i}"] + 7 for i in range(3)}
+    splat = read_splat(write(tmp_path / "a.ply", values))
+    assert np.array_equal(splat.log_scales[:, 0], values["scale_0"])
+
+
+def test_missing_properties_that_have_a_meaning(tmp_path: Path) -> None:
+    rot = {f"rot_{i}": (lambda v: None) for i in range(4)}
+    gone = {f"f_dc_{i}": (lambda v: None) for i in range(3)}
+    colors = {name: (lambda v: np.full(COUNT, 51, np.uint8)) for name in ("red", "green", "blue")}
+    splat = read_splat(write(tmp_path / "a.ply", changed(scale_2=lambda v: None, **rot, **gone, **colors)))
+    assert np.array_equal(splat.quats, np.tile([1, 0, 0, 0], (COUNT, 1)))
+    assert np.allclose(0.5 + 0.28209479 * splat.sh[:, 0], 0.2, atol=1e-6)
+    assert np.all(splat.log_scales[:, 2] < splat.log_scales[:, :2].min(axis=1) - 6)
+
+
+def test_rows_that_are_no_numbers_are_kept_and_counted(tmp_path: Path) -> None:
+    values = columns(0)
+    values["x"][3], values["opacity"][5], values["scale_1"][7], values["rot_0"][9] = np.nan, np.nan, np.inf, np.inf
+    values["opacity"][11] = np.inf  # opaque, as some tools write it
+    splat = read_splat(write(tmp_path / "a.ply", values))
+    assert np.flatnonzero(splat.parked).tolist() == [3, 5, 7, 9]
+    assert len(splat) == COUNT
+    assert np.all(splat.opacity_logits[splat.parked] < -50)
+    assert all(np.isfinite(splat.arrays()[name]).all() for name in ("means", "quats", "sh"))
+    assert any("4 Gaussians that are not finite" in note for note in splat.notes)
+
+
+def spz_of(version: int, count: int = 100, degree: int = 1) -> tuple[bytes, dict[str, np.ndarray]]:
+    """A file of a version, and its values in the axes of the PLY, written from the format's description."""
+    rng = np.random.default_rng(version)
+    k = (degree + 1) ** 2 - 1
+    fixed = rng.integers(-(2**14), 2**14, (count, 3))
+    alphas, colors, scales, rest = (rng.integers(1, 255, (count, n)).astype(np.uint8) for n in (1, 3, 3, 3 * k))
+    quats = rng.normal(size=(count, 4))
+    quats *= np.sign(np.take_along_axis(quats, np.abs(quats).argmax(axis=1)[:, None], axis=1))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)  # x y z w; the largest positive
+    if version == 1:
+        positions = (fixed / 4096).astype("<f2").tobytes()
+    else:
+        positions = b"".join(int(v).to_bytes(3, "little", signed=True) for v in fixed.ravel())
+    if version == 3:
+        words = []
+        for q in quats:
+            largest, word = int(np.abs(q).argmax()), 0
+            for i in (i for i in range(4) if i != largest):
+                word = word << 10 | (512 if q[i] < 0 else 0) | round(abs(q[i]) * np.sqrt(2) * 511)
+            words.append(largest << 30 | word)
+        turns = np.array(words, "<u4").tobytes()
+    else:
+        quats = quats * np.where(quats[:, 3:] < 0, -1, 1)
+        turns = np.rint(quats[:, :3] * 127.5 + 127.5).astype(np.uint8).tobytes()
+    header = struct.pack("<IIIBBBB", MAGIC, version, count, degree, 12, 0, 0)
+    parts = [alphas.tobytes(), colors.tobytes(), scales.tobytes(), turns, rest.tobytes()]
+    return gzip.compress(header + positions + b"".join(parts)), {
+        "means": fixed / 4096 * [1, -1, -1],
+        "opacity": alphas[:, 0] / 255,
+        "log_scales": scales / 16.0 - 10,
+        "quats": quats[:, [3, 0, 1, 2]] * [1, 1, -1, -1],
+        "first": (rest.reshape(count, k, 3)[:, 0] - 128.0) / 128 * -1,  # y: odd in y
+    }
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_spz_of_every_version(tmp_path: Path, version: int) -> None:
+    data, wanted = spz_of(version)
+    (tmp_path / "a.spz").write_bytes(data)
+    splat = read_splat(tmp_path / "a.spz")
+    assert np.allclose(splat.means, wanted["means"], atol=3e-3 if version == 1 else 1e-6)
+    assert np.allclose(1 / (1 + np.exp(-splat.opacity_logits)), wanted["opacity"], atol=1e-5)
+    assert np.allclose(splat.log_scales, wanted["log_scales"])
+    assert np.allclose(splat.sh[:, 1], wanted["first"])
+    cosine = np.abs((splat.quats * wanted["quats"]).sum(axis=1)) / np.linalg.norm(splat.quats, axis=1)
+    assert cosine.min() > (0.9999 if version == 3 else 0.99)  # w is the root of what three rounded squares leave
+
+
+def refused(path: Path) -> str:
+    with pytest.raises(InputError) as error:
+        read_splat(path)
+    text = str(error.value)
+    assert text.startswith(str(path))
+    assert "\n" not in text
+    return text
+
+
+def test_what_is_no_splat_is_told(tmp_path: Path) -> None:
+    values = columns(0)
+    cloud = write(tmp_path / "cloud.ply", {name: values[name] for name in "xyz"})
+    assert "cloud of points" in refused(cloud)
+    vertex = PlyElement.describe(np.zeros(3, [(n, "f4") for n in "xyz"]), "vertex")
+    face = PlyElement.describe(np.array([([0, 1, 2],)], [("vertex_indices", "i4", (3,))]), "face")
+    PlyData([vertex, face]).write(str(tmp_path / "mesh.ply"))
+    assert "is a mesh" in refused(tmp_path / "mesh.ply")
+    assert "holds no Gaussians" in refused(write(tmp_path / "none.ply", {n: v[:0] for n, v in values.items()}))
+    assert "one blob" in refused(write(tmp_path / "blob.ply", values | {n: np.zeros(COUNT, np.float32) for n in "xyz"}))
+    odd = refused(write(tmp_path / "odd.ply", values | {"f_rest_0": values["x"]}))
+    assert "has 1 properties f_rest_*" in odd
+    nan = {name: np.full(COUNT, np.nan, np.float32) for name in "xyz"}
+    assert "0 of 300 rows are numbers" in refused(write(tmp_path / "nan.ply", values | nan))
+
+
+def test_spz_that_cannot_be_read_is_told(tmp_path: Path) -> None:
+    good = gzip.decompress(spz_of(2)[0])
+    file = tmp_path / "a.spz"
+    for data, words in (
+        (gzip.compress(struct.pack("<II", MAGIC, 7) + good[8:]), "of version 7"),
+        (struct.pack("<II", MAGIC, 4) + bytes(24), "of version 4"),
+        (gzip.compress(good[:-100]), "is cut short"),
+        (gzip.compress(b"x" * 64), "is no .spz file"),
+        (b"no gzip", "cannot be read"),
+    ):
+        file.write_bytes(data)
+        assert words in refused(file)
