@@ -75,7 +75,7 @@ def for_starved_masks(gaussians: Gaussians, views: list[TrainingView], seed: int
             continue
         K, pose = seen[k].camera
         new = unprojected(K, pose, pixels[:, 1] + 0.5, pixels[:, 0] + 0.5, seen[k].depth[tuple(pixels.T)])
-        if any(_confirms(other, new, seen[k], mask) for j, other in enumerate(seen) if j != k):
+        if any(_confirms(other, new, seen[k], int(mask)) for j, other in enumerate(seen) if j != k):
             placed.append((k, pixels))
             points = np.concatenate([points, new])
     return _made(like, seen, placed, points, seed)
