@@ -87,7 +87,7 @@ def align_by_matches(main: Any, other: Any, matches: Matches, seed: int) -> bool
     there = np.array([other.points3D[b].xyz for _, b in linked])
     near = NEAR * float(np.median(np.linalg.norm(here - np.median(here, axis=0), axis=1)))
     pycolmap.set_random_seed(seed)
-    ransac = pycolmap.RANSACOptions(max_error=near, min_inlier_ratio=0.05, random_seed=seed)
+    ransac = pycolmap.RANSACOptions(max_error=near, min_inlier_ratio=0.1, max_num_trials=5000, random_seed=seed)
     found = pycolmap.estimate_sim3d_robust(there, here, ransac)
     if found is None or found["num_inliers"] < MATCHED:
         return False
