@@ -19,7 +19,7 @@ from perception.geometry import align_similarity
 from perception.io.atomic import atomic_directory, recover
 from perception.photos.lens import load_pycolmap
 from perception.sfm import merge
-from perception.sfm.consistency import consistent_photos, fold_warnings, verified_pairs
+from perception.sfm.consistency import consistent_photos, fold_warnings, stronger_contradictions, verified_pairs
 from perception.sfm.database import FeatureStore, verified_matches
 from perception.sfm.feature_tasks import write_part
 from perception.sfm.features import FEW_FEATURES, THOROUGH, Group, extract, match
@@ -163,11 +163,27 @@ class Escalation:
     def _anew(self, store: FeatureStore) -> Candidate | None:
         found = []
         for models, out in candidates(store, self.fixed, self.options.seed, self.options.progress, most=CANDIDATES):
-            complete = models[0].num_reg_images()
+            whole = load_pycolmap().Reconstruction(models[0])
             found.append(self._checked(models, out, store))
-            if len(found[-1].registered) >= complete and not found[-1].folded:
+            if len(found[-1].registered) >= whole.num_reg_images() and not found[-1].folded:
+                break
+            found += self._parts_joined(whole, store)
+            if len(found[-1].registered) == len(store.names) and not found[-1].folded:
                 break
         return max(found, key=lambda each: (not each.folded, each.support), default=None)
+
+    def _parts_joined(self, model: Any, store: FeatureStore) -> list[Candidate]:
+        """One model of the two parts that matches divide in a folded one: these matches say where the second lies."""
+        pairs, matches = verified_pairs(model, store.database), verified_matches(store.database)
+        if not stronger_contradictions(pairs):
+            return []
+        first = consistent_photos(pairs)
+        second = consistent_photos([pair for pair in pairs if not {pair.i, pair.j} & first])
+        against = {(pair.i, pair.j): matches[pair.i, pair.j] for pair in pairs if not pair.agrees}
+        main, other = merge.part_of(model, first), merge.part_of(model, second)
+        if len(second) < MIN_MODEL_SIZE or not merge.align_by_matches(main, other, against, self.options.seed):
+            return []
+        return [self._grown(self._adjusted([main, other], store), store, joined=True)]
 
     def _join(self, store: FeatureStore) -> Candidate | None:
         """One model of those that share photos."""
@@ -213,17 +229,19 @@ class Escalation:
         options = pipeline_options(self.fixed, self.options.seed, one_thread=True, effort=store.effort)
         return merge.adjusted(merge.merged(models), store, options, add=False)
 
-    def _grown(self, start: Any, store: FeatureStore, again: bool = True) -> Candidate:
+    def _grown(self, start: Any, store: FeatureStore, again: bool = True, joined: bool = False) -> Candidate:
         """`start` with photos added."""
         seed, count, progress = self.options.seed, len(store.names), self.options.progress
         found = map_photos(store, self.fixed, seed, count, progress, one_thread=True, start=start)
-        return self._checked(*found, store, again)
+        return self._checked(*found, store, again, joined)
 
-    def _checked(self, models: list[Any], contradicted: set[str], store: FeatureStore, again: bool = True) -> Candidate:
+    def _checked(
+        self, models: list[Any], contradicted: set[str], store: FeatureStore, again: bool = True, joined: bool = False
+    ) -> Candidate:
         """Without photos that matches contradict or few others hold; where there are such, the rest is adjusted anew.
-        again: then photos are added once more, as the wrong ones may have been in the way."""
+        again: then photos are added once more, as the wrong ones may have been in the way. joined: of two parts."""
         best, complete = models[0], models[0].num_reg_images()
-        while (wrong := _contradicted(best, store)) | (loose := _loose(best)):
+        while (wrong := _contradicted(best, store, joined)) | (loose := _loose(best)):
             contradicted = contradicted | {best.images[image].name for image in wrong}
             take_out(best, wrong | loose)
             if best.num_reg_images() < MIN_MODEL_SIZE:
@@ -237,7 +255,7 @@ class Escalation:
         kept = Candidate([best, *(each for each in new if new[each] >= MIN_MODEL_SIZE)], contradicted, store)
         if not again or largest == complete:
             return kept
-        grown = self._grown(self._adjusted([best], store), store, again=False)
+        grown = self._grown(self._adjusted([best], store), store, again=False, joined=joined)
         return grown if grown.registered > kept.registered and grown.support > kept.support else kept
 
     # --------------------------------------------------------------- features
@@ -272,9 +290,13 @@ class Escalation:
         return FeatureStore(folder, store.image_root, names, facts, THOROUGH)
 
 
-def _contradicted(model: Any, store: FeatureStore) -> set[int]:
-    """Photos of a model that the matches of others contradict."""
-    return set(model.reg_image_ids()) - consistent_photos(verified_pairs(model, store.database))
+def _contradicted(model: Any, store: FeatureStore, joined: bool) -> set[int]:
+    """Photos of a model that the matches of others contradict. joined: of its two parts, none if no contradicted pair
+    is stronger than those it rests on, as where textures are equal, right models contradict many."""
+    pairs = verified_pairs(model, store.database)
+    if joined and not stronger_contradictions(pairs):
+        return set()
+    return set(model.reg_image_ids()) - consistent_photos(pairs)
 
 
 def _loose(model: Any) -> set[int]:

@@ -12,10 +12,15 @@ import numpy as np
 
 from perception.photos.lens import load_pycolmap
 from perception.sfm.database import FeatureStore
-from perception.sfm.incremental import MIN_MODEL_SIZE
+from perception.sfm.incremental import MIN_MODEL_SIZE, take_out
+
+Matches = dict[tuple[int, int], np.ndarray]
 
 SHARED = 3
 """Least number of photos by which two models are joined."""
+MATCHED, NEAR = 50, 0.02
+"""Least number of matched points by which two parts are joined, and the distance at which they fit, relative to the
+median distance of these points from their centre."""
 TOLERANCE, DIRECT = 1e-6, 20_000
 """Of the last bundle adjustment: the relative gain at which it ends (the distance between rooms is known by few photos,
 so 1e-5 is too early), and photos up to which its normal equations are solved by factorisation, which is then faster."""
@@ -57,6 +62,37 @@ def align(models: Sequence[Any], seed: int) -> list[list[Any]]:
         groups.append(sorted(group))
     groups.sort(key=lambda group: -len(set().union(*(photos[n] for n in group))))
     return [[models[n] for n in group] for group in groups]
+
+
+def part_of(model: Any, photos: set[int]) -> Any:
+    """A copy of a model with only these photos and what they see."""
+    part = load_pycolmap().Reconstruction(model)
+    take_out(part, set(model.reg_image_ids()) - photos)
+    return part
+
+
+def align_by_matches(main: Any, other: Any, matches: Matches, seed: int) -> bool:
+    """Moves `other` so that most of its matched points lie on those of `main`; False where few do.
+    matches: verified ones [M, 2] of pairs of image ids. Points are of tracks, so one match of two tracks is enough."""
+    pycolmap, linked = load_pycolmap(), dict[tuple[int, int], None]()
+    for pair, found in matches.items():
+        for side in (0, 1):
+            if pair[side] in main.reg_image_ids() and pair[1 - side] in other.reg_image_ids():
+                one, two = main.images[pair[side]].points2D, other.images[pair[1 - side]].points2D
+                ends = ((one[int(m[side])], two[int(m[1 - side])]) for m in found)
+                linked |= {(a.point3D_id, b.point3D_id): None for a, b in ends if a.has_point3D() and b.has_point3D()}
+    if len(linked) < MATCHED:
+        return False
+    here = np.array([main.points3D[a].xyz for a, _ in linked])
+    there = np.array([other.points3D[b].xyz for _, b in linked])
+    near = NEAR * float(np.median(np.linalg.norm(here - np.median(here, axis=0), axis=1)))
+    pycolmap.set_random_seed(seed)
+    ransac = pycolmap.RANSACOptions(max_error=near, min_inlier_ratio=0.1, max_num_trials=5000, random_seed=seed)
+    found = pycolmap.estimate_sim3d_robust(there, here, ransac)
+    if found is None or found["num_inliers"] < MATCHED:
+        return False
+    other.transform(found["tgt_from_src"])
+    return True
 
 
 def merged(models: Sequence[Any]) -> Any:

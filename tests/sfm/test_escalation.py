@@ -163,7 +163,7 @@ def test_a_scene_is_mapped_anew_where_nothing_is_registered_at_once(
     room = Room()
     more = room.store(tmp_path / MORE, THOROUGH, lambda i, j: j - i < 5)
     monkeypatch.setattr(Escalation, "_more_features", lambda self: more)
-    none = Candidate([], set(), FeatureStore(tmp_path, more.image_root, more.names, {}))
+    none = Candidate([], set(), FeatureStore(more.folder, more.image_root, more.names, {}))
     best, steps = Escalation(none, [], False, ReadOptions(tmp_path, progress=Told())).run()
     assert [step["step"] for step in steps] == ["at once", "more features", "mapping anew"]
     assert len(best.registered) == PHOTOS and room.wrong(best) == 0
