@@ -20,10 +20,10 @@ OWN, WANTED = 16, 24  # Gaussians: a segment of the grouping has 16
 SOLID = 0.1  # least opacity of a Gaussian that counts
 NEAR = 0.03  # relative difference of depths of one surface
 WITHIN = 0.5  # largest scale of a Gaussian of a mask, over the radius of a disc of the mask's area
-AGREE = 0.6  # share of the points that another photo must show in one mask
+AGREE = 0.4  # share of the points that another photo must show in one mask; a pixel off, it misses half of a fork
 ALIKE = 4.0  # factor within which the areas of both masks agree, seen from the same distance
 MOST = 0.05  # of all Gaussians are placed
-OPACITY = 0.5  # of those placed, as of those that fill holes
+OPACITY = 0.9  # of those placed; training has little time left to strengthen them against what they stand before
 
 
 @dataclass(frozen=True)
@@ -60,9 +60,8 @@ def for_starved_masks(gaussians: Gaussians, views: list[TrainingView], seed: int
     """The Gaussians to add; at most MOST of the N given."""
     like = gaussians.to(torch.device("cpu"))
     seen = [_seen(like, view) for view in views if view.labels is not None and bool((view.labels > 0).any())]
-    starved = [
-        (k, m) for k, one in enumerate(seen) for m in np.flatnonzero((one.area >= LEAST_PIXELS) & (one.own < OWN))
-    ]
+    lacking = [np.flatnonzero((one.area >= LEAST_PIXELS) & (one.own < OWN)).tolist() for one in seen]
+    starved = [(k, mask) for k, masks in enumerate(lacking) for mask in masks]
     starved.sort(key=lambda km: (-seen[km[0]].area[km[1]], km))
     placed: list[tuple[int, np.ndarray]] = []  # of each mask, the photo and its pixels [P, 2], row and column
     points, most = np.zeros((0, 3)), int(MOST * len(like))
@@ -106,14 +105,10 @@ def _spread(mask: np.ndarray, depth: np.ndarray) -> np.ndarray:
 def _confirms(other: _Seen, points: np.ndarray, seen: _Seen, mask: int) -> bool:
     """Whether `other` shows points [P, 3] of a mask of `seen` in one mask that is as large as it should be there."""
     label, z = other.shown(points)
-    counts = np.bincount(label, minlength=1)
-    counts[0] = 0
-    best = int(counts.argmax())
-    if counts[best] < AGREE * len(points) or other.area[best] < LEAST_PIXELS:
-        return False
     nearer = float(np.median(seen.shown(points)[1]) / np.median(z)) * float(other.view.K[0, 0] / seen.view.K[0, 0])
     expected = seen.area[mask] * nearer**2
-    return bool(expected / ALIKE <= other.area[best] <= expected * ALIKE)
+    alike = (other.area >= max(LEAST_PIXELS, expected / ALIKE)) & (other.area <= expected * ALIKE)
+    return bool((np.bincount(label, minlength=len(alike)) * alike).max() >= AGREE * len(points))
 
 
 def _made(

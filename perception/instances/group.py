@@ -27,6 +27,7 @@ LEAST_SEGMENTS, MAX_SEGMENTS = 32, 1000
 PER_SEGMENT_BEYOND = 300  # Gaussians of a segment in maps where that makes more than MAX_SEGMENTS: bounds the time
 ROUNDS = 3  # in which Gaussians that disagree with their segment leave it
 LEAST = 4  # Gaussians; smaller groups are dropped even if masks support them
+LEAST_AREA = 15  # pixels of a mask at half the resolution: 60 of the photo
 LEAST_OF_MEDIAN = 0.25  # size of a group that no photo supports, relative to the median
 
 
@@ -136,15 +137,30 @@ def _parted_by_masks(
 
 def _without_small(ids: np.ndarray, votes: MaskVotes, min_size: int) -> np.ndarray:
     """Sets ids to −1 for two kinds of groups: below `min_size` and supported by fewer than two photos; supported by no
-    photo and smaller than LEAST_OF_MEDIAN of the median group."""
+    photo and smaller than LEAST_OF_MEDIAN of the median group. None is what two photos show (`_shown`)."""
     count = int(ids.max(initial=-1)) + 1
     if count == 0:
         return ids
     sizes = np.bincount(ids[ids >= 0], minlength=count)
-    support = evidence(votes.of_groups(ids, count)).support
+    groups = votes.of_groups(ids, count)
+    support = evidence(groups).support
     kept = (sizes >= min_size) | ((sizes >= LEAST) & (support >= 2))
     kept &= (support > 0) | (sizes >= LEAST_OF_MEDIAN * np.median(sizes[sizes > 0]))
+    kept |= (sizes >= LEAST) & (_shown(groups) >= 2)
     return np.where((ids >= 0) & np.append(kept, False)[ids], ids, -1)
+
+
+def _shown(groups: MaskVotes) -> np.ndarray:
+    """[K] number of masks of LEAST_AREA or more that fit no other group as well, in which most of the group lies: what
+    straddles their border may hide most of such a mask, so that the group's own IoU with it is small."""
+    row, _, first, labelled = groups.runs()
+    pixels, mask = groups.pixels.data.astype(np.float64), groups.pixels.indices
+    filled = groups.per_entry(first, labelled + np.asarray(groups.void[row, groups.view[mask[first]]]).reshape(-1))
+    iou = pixels / np.maximum(filled + groups.area[mask] - pixels, 1e-12)
+    best = np.zeros(len(groups.area))
+    np.maximum.at(best, mask, iou)
+    fits = (iou == best[mask]) & (pixels >= LEAST_AGREEMENT * filled) & (groups.area[mask] >= LEAST_AREA)
+    return np.bincount(groups.per_entry(first, row)[fits], minlength=groups.pixels.shape[0])
 
 
 def _scored(ids: np.ndarray, parts: np.ndarray, parents: np.ndarray, votes: MaskVotes) -> Grouping:

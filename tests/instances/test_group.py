@@ -15,7 +15,7 @@ pytest.importorskip("perception._core")
 from perception.config import InstanceConfig
 from perception.gaussians.model import Nearby, from_points
 from perception.gaussians.views import TrainingView
-from perception.instances.group import Grouping, group
+from perception.instances.group import Grouping, _without_small, group
 from perception.instances.votes import MaskVotes, beside, mask_votes
 from perception.rasterizer.rasterize import rasterize
 from support.blob_scenes import BlobScene, make_scene, orbit, random_scene, with_errors
@@ -247,3 +247,17 @@ def test_the_same_input_gives_the_same_groups() -> None:
     scene = with_errors(random_scene(7, count=8, views=10), np.random.default_rng(2))
     first, second = run(scene), run(scene)
     assert np.array_equal(first.ids, second.ids) and np.array_equal(first.scores, second.scores)
+
+
+@pytest.mark.parametrize("photos", [1, 2])
+def test_a_ring_is_kept_that_two_photos_show_though_its_gaussians_fill_a_fifth_of_its_masks(photos: int) -> None:
+    """The table's Gaussians straddle its border and fill the rest, so its IoU with its masks is only .2."""
+    ids = np.repeat(np.array([0, 1], np.int32), [40, 6])
+    shares = np.zeros((46, 2 * photos), np.float32)  # table and ring of each photo
+    shares[:40, 0::2], shares[:40, 1::2] = 10_000 / 40, 80 / 40
+    shares[40:, 1::2] = 20 / 6
+    view, area = np.repeat(np.arange(photos), 2), np.tile([10_000.0, 100.0], photos)
+    votes = MaskVotes(sparse.csr_matrix(shares), sparse.csr_matrix((46, photos), dtype=np.float32), view, area)
+    kept = _without_small(ids, votes, 32)
+    assert (kept[:40] == 0).all()
+    assert (kept[40:] == (1 if photos == 2 else -1)).all()
