@@ -29,7 +29,7 @@ def load_scene(source: Path, options: ReadOptions) -> Scene:
     if masks is not None and not masks.is_dir():
         raise InputError(f"{masks}: no such folder of masks")
     lens, start = None if camera is None else read_camera(camera), None if cloud is None else start_points(cloud)
-    options = replace(options, lens=lens, cloud=start)
+    options = replace(options, lens=lens, cloud=start or options.cloud)
     options.workdir.mkdir(parents=True, exist_ok=True)
     scene = reader.read(source, options)
     scene.report["notes"] = [*other_inputs(source, reader), *scene.report.get("notes", [])]

@@ -28,7 +28,7 @@ class ReadOptions:
     used instead of sparse points. poses: "keep", "refine", or "auto": checked where features are matched anyway or
     views have depth, and refined where they are wrong (see sfm.pose_refinement). engine: where features are made.
     still: what stays in the picture while the camera moves is ignored (see `photos.still`).
-    lens, cloud: what `load_scene` reads from `camera` and `init_points`.
+    lens, cloud: what `load_scene` reads from `camera` and `init_points`, if these are given.
     """
 
     workdir: Path

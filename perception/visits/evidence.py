@@ -27,6 +27,10 @@ WEIGHTS = {"correlation": (14.0, 0.52), "outline": (3.0, 0.60), "colour": (-8.0,
 SAME_OUTLINE = 6.0
 """Further log-odds per unit of the outlines' IoU for a thing at a new spot, where another thing may stand."""
 
+TEMPER = 2.0
+"""Divisor of log-odds for a probability, as the signs that they add up depend on each other. Fitted on made visits: of
+65 states 94 % came true, where it says 91 %, and without it 98 %."""
+
 
 @dataclass(frozen=True)
 class Signs:
@@ -62,8 +66,8 @@ class Signs:
 
 
 def probability(log_odds: float) -> float:
-    """In [0, 1], of log-odds."""
-    return float(1 / (1 + np.exp(-np.clip(log_odds, -30, 30))))
+    """In [0, 1], of the log-odds of signs."""
+    return float(1 / (1 + np.exp(-np.clip(log_odds / TEMPER, -30, 30))))
 
 
 def signs_of(looks: Sequence[Look], things: Sequence[int], shares: np.ndarray, depths: np.ndarray) -> list[Signs]:

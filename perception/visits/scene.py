@@ -11,6 +11,7 @@ import numpy as np
 from perception.config import MapConfig, fields, flat, load_config
 from perception.errors import InputError
 from perception.frame.recentre import map_from_input, moved
+from perception.geometry import move_points
 from perception.inputs.load import load_scene
 from perception.inputs.readers import reader_of
 from perception.inputs.transforms import in_map_frame
@@ -29,8 +30,8 @@ from perception.types import Scene, View
 from perception.visits.look import Look, correlation
 from perception.visits.record import time_taken
 
-NO_CLOUD = np.zeros((1, 3)), np.zeros((1, 3), np.uint8)
-"""The map is what training starts from."""
+POINTS = 1000
+"""Of the map, that stand for the sparse cloud of a visit, so that none is triangulated."""
 LEAST_MAPPED, LEAST_ALIKE = 0.2, 0.35
 """A photo shows the map where that covers at least this share of it, with at least this correlation of brightness."""
 LEAST_SHARE = 0.8
@@ -61,7 +62,10 @@ def visit_scene(run: Run, gmap: Map, output: Path) -> Scene:
     photos, source = run.config.photos, run.source
     camera, masks = (Path(file) if file else None for file in (photos.camera, photos.ignore_masks))
     options = ReadOptions(run.work / "sfm", run.config.seed, run.progress, photos.strict, masks, camera)
-    options = replace(options, frames=frames_folder(output), poses="keep", cloud=NO_CLOUD)
+    b_from_a = map_from_input(gmap.path, gmap.info)
+    some = move_points(np.linalg.inv(b_from_a), gmap.means[:: max(1, len(gmap) // POINTS)].astype(np.float64))
+    cloud = some, np.zeros((len(some), 3), np.uint8)
+    options = replace(options, frames=frames_folder(output), poses="keep", cloud=cloud)
     if not reader_of(source).poses:
         photos_of = source
         if source.suffix.lower() in VIDEO_SUFFIXES and source.is_file():
@@ -74,7 +78,6 @@ def visit_scene(run: Run, gmap: Map, output: Path) -> Scene:
     placed = source / "transforms.json" if source.is_dir() else source
     if placed.suffix == ".json" and placed.is_file() and in_map_frame(placed):
         return scene
-    b_from_a = map_from_input(gmap.path, gmap.info)
     return replace(scene, views=[moved(view, b_from_a) for view in scene.views])
 
 

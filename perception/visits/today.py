@@ -137,8 +137,8 @@ def _shown_before(
     visit: Visit, before: list[Look], grown: Gaussians, things: list[tuple[np.ndarray, float]], gone: list[int]
 ) -> tuple[set[int], set[int]]:
     """Numbers of the things that the old map shows as the photos do, `before`: it only did not know them as things.
-    A thing in front of one that is `gone`, or in its place, is none of these. Numbers of those that have the outline of
-    no mask: they are ground that was hidden until now."""
+    A thing in front of one that is `gone`, or in its place, is none of these. Numbers of those that no photo shows, or
+    that have the outline of no mask: they are ground that was hidden until now."""
     ids = np.full(len(grown), -1, np.int32)
     for j, (rows, _) in enumerate(things):
         ids[rows] = j
@@ -151,7 +151,7 @@ def _shown_before(
     signs = signs_of(looks, range(len(things)), np.ones(len(things)), anywhere)
     fresh = instead > INSTEAD * pixels
     known = {j for j, each in enumerate(signs) if each.photos and each.log_odds > 0 and not fresh[j]}
-    return known, {j for j, each in enumerate(signs) if each.outline < OUTLINED}
+    return known, {j for j, each in enumerate(signs) if not each.photos or each.outline < OUTLINED}
 
 
 def _moved(

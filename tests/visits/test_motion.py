@@ -9,10 +9,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from perception.gaussians.model import Gaussians, isotropic
-from perception.gaussians.views import render
+from perception.gaussians.views import TrainingView, render
 from perception.instances.group import Grouping
-from perception.visits.motion import assigned
-from perception.visits.registration import Points, angle_between, carried, register
+from perception.visits.motion import Cut, assigned, judged, refined
+from perception.visits.registration import Points, angle_between, carried, looks_round, register
 from perception.visits.today import _without_fragments
 from support.aimed import look_at
 
@@ -70,6 +70,41 @@ def test_a_carried_thing_looks_as_the_thing_does_from_the_carried_camera() -> No
     before, after = image(gaussians, pose), image(carried(gaussians, turn), pose @ np.linalg.inv(turn))
     assert before.max() > 0.3
     assert np.quantile(np.abs(before - after), 0.99) < 2e-3
+
+
+def test_a_motion_is_refined_to_the_one_that_the_photos_show() -> None:
+    """Photos are renders of the moved thing, so the motion is known; the search starts 9° and 2 cm off."""
+    rng = np.random.default_rng(4)
+    generator = torch.Generator().manual_seed(1)
+    points, colors = thing(rng, 500).points, torch.rand(500, 3, generator=generator)
+    gaussians = isotropic(points, torch.full((500,), -4.6), colors, 0.9, 2, generator)
+    true = motion(40.0, (0.1, 0.05, 0.0))
+    K, cuts = torch.tensor([[110.0, 0, 32], [0, 110, 32], [0, 0, 1]]), []
+    for eye in ((0.6, 0.1, 0.4), (-0.3, 0.5, 0.4), (0.0, -0.5, 0.6)):
+        camera = torch.from_numpy(look_at(np.array(eye), true[:3, 3], UP).astype(np.float32))
+        out = render(carried(gaussians, true), camera, K, 64, 64, harmonics=True)
+        photo = (out.colors[0].clamp(0, 1) * 255).to(torch.uint8)
+        labels = (out.alphas[0] > 0.5).to(torch.int32)
+        view = TrainingView("a", photo, labels, K, camera)
+        empty = np.zeros((64, 64), np.float32)
+        cuts.append(Cut(view, empty, np.zeros((64, 64, 3), np.float32), np.full((64, 64), np.inf)))
+    start = motion(49.0, (0.12, 0.05, 0.0))
+    found = refined(gaussians, judged(gaussians, [start], cuts, 0.06)[0], cuts, 0.06, 0.1, 0.03)
+    assert found[0].same > judged(gaussians, [start], cuts, 0.06)[0][0].same + 1
+    assert angle_between(found[1], true) < 2 and np.linalg.norm((found[1] - true)[:3, 3]) < 0.003
+
+
+def test_round_things_are_told_from_those_with_a_handle_and_those_with_a_stripe() -> None:
+    rng = np.random.default_rng(5)
+    angle, height = rng.uniform(0, 2 * np.pi, 900), rng.uniform(-0.05, 0.05, 900)
+    can = np.stack([0.04 * np.cos(angle), 0.04 * np.sin(angle), height], axis=1)
+    shade = 0.4 + 0.3 * np.cos(angle)[:, None]  # light from one side
+    plain = Points(can, shade * [0.9, 0.5, 0.3])
+    handle = rng.uniform([0.045, -0.005, -0.03], [0.08, 0.005, 0.03], (150, 3))
+    striped = np.where(np.abs(angle - 2)[:, None] < 0.5, [0.2, 0.3, 0.9], [0.9, 0.5, 0.3])
+    assert looks_round(plain, UP) and not looks_round(plain, np.array([1.0, 0, 0]))
+    assert not looks_round(Points(np.concatenate([can, handle]), np.full((1050, 3), 0.5)), UP)
+    assert not looks_round(Points(can, striped), UP)
 
 
 def test_pairs_have_the_largest_sum_of_log_odds() -> None:

@@ -122,8 +122,9 @@ def scores(changes: list[dict[str, Any]], first: Map, second: Map, truth: Truth)
             lost += told["state"] == "removed"
         if told["state"] == "moved" and told.get("transform") and truth.entries[thing]["transform"]:
             error = _error(np.array(told["transform"]), np.array(truth.entries[thing]["transform"]), thing, truth)
-            blind += told.get("axis") is not None
-            errors.append((*error[:2], np.nan if told.get("axis") is not None else error[2]))
+            unknown = told.get("axis") is not None or told.get("ambiguous", False)
+            blind += unknown
+            errors.append((*error[:2], np.nan if unknown else error[2]))
     for change in changes:  # of instances that are no thing: those on stuff do not count
         new, instance = change["state"] == "added", change["instance_id"]
         if instance not in (after if new else before).values():
