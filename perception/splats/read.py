@@ -69,7 +69,7 @@ def read_splat(path: Path) -> Splat:
     version, and a damaged file."""
     if path.suffix.lower() == ".spz":
         stored = read_spz(path)
-        means, quats, log_scales, logits, sh = (stored[name] for name in NAMES)
+        means, quats, log_scales, logits, sh = (np.ascontiguousarray(stored[name]) for name in NAMES)
         splat = Splat(means, quats, log_scales, logits, sh)
     else:
         rows = _ply_rows(path)
