@@ -77,7 +77,7 @@ class FrameConfig(Settings):
 class SplatConfig(Settings):
     cameras: str | None = Field(None, description="of a finished splat: COLMAP model or transforms.json, used first")
     up: str | None = Field(None, description="of a finished splat: z, -y, ... or X,Y,Z; none: as its floor lies")
-    unit: Literal["metre"] | None = Field(None, description="of a finished splat, where it is known")
+    unit: str | None = Field(None, pattern="^metre$", title="metre", description="of a finished splat, if known")
 
 
 class SamConfig(Settings):

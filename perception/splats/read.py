@@ -69,15 +69,20 @@ def read_splat(path: Path) -> Splat:
     version, and a damaged file."""
     if path.suffix.lower() == ".spz":
         stored = read_spz(path)
-        means, quats, log_scales, logits, sh = (stored[name] for name in NAMES)
+        means, quats, log_scales, logits, sh = (np.ascontiguousarray(stored[name]) for name in NAMES)
         splat = Splat(means, quats, log_scales, logits, sh)
     else:
         rows = _ply_rows(path)
+        _check_count(path, len(next(iter(rows.values()))))
         splat = _compressed(rows) if "packed_position" in rows else _plain(path, rows)
-    if len(splat) < LEAST_ROWS:
-        found = f"holds {len(splat)} Gaussians" if len(splat) else "holds no Gaussians"
-        raise InputError(f"{path}: {found}, expected a scene of at least {LEAST_ROWS}; give the scene it was cut from")
+    _check_count(path, len(splat))
     return _parked(path, splat)
+
+
+def _check_count(path: Path, count: int) -> None:
+    if count < LEAST_ROWS:
+        found = f"holds {count} Gaussians" if count else "holds no Gaussians"
+        raise InputError(f"{path}: {found}, expected a scene of at least {LEAST_ROWS}; give the scene it was cut from")
 
 
 def _ply_rows(path: Path) -> Mapping[str, np.ndarray]:
@@ -139,12 +144,15 @@ def _decoded(
     means: np.ndarray, scales: np.ndarray, opacity: np.ndarray, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Log-scales [N, 3] and opacity logits [N], of scales [N, 2 or 3] and opacities of either coding."""
-    low, high = np.nanpercentile(np.where(np.isfinite(means), means, np.nan), [5, 95], axis=0)
-    large = bool(np.exp(np.nanmedian(scales)) > LINEAR_SHARE * max(float((high - low).max()), 1e-12))
-    if np.nanmin(scales) > 0 and large:
+    good = np.isfinite(means).all(axis=1) & ~np.isnan(scales).any(axis=1) & ~np.isnan(opacity)
+    if not good.any():
+        return scales, opacity
+    low, high = np.percentile(means[good], [5, 95], axis=0)
+    large = bool(np.exp(np.median(scales[good])) > LINEAR_SHARE * max(float((high - low).max()), 1e-12))
+    if scales[good].min() > 0 and large:
         scales = np.log(scales)
         notes.append("scales are lengths, not their logarithms, as all are positive; the map holds logarithms")
-    if np.nanmin(opacity) >= 0 and np.nanmax(opacity) <= 1:
+    if opacity[good].min() >= 0 and opacity[good].max() <= 1:
         clipped = np.clip(opacity.astype(np.float64), 1e-6, 1 - 1e-6)
         opacity = np.log(clipped / (1 - clipped)).astype(np.float32)
         notes.append("opacities are in [0, 1], not logits; the map holds logits")

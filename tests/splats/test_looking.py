@@ -63,6 +63,7 @@ def test_cameras_stand_in_the_room_and_see_it_all(tmp_path: Path, name: str, cei
     assert np.mean(times >= FIVE) > 0.9
 
 
+@pytest.mark.slow
 def test_the_choice_is_the_same_twice(tmp_path: Path) -> None:
     columns, _ = room_columns()
     splat = read_splat(write_room(tmp_path / "room.ply", columns))
@@ -87,6 +88,7 @@ def test_up_is_read(tmp_path: Path) -> None:
             direction(text)
 
 
+@pytest.mark.slow
 def test_one_blob_is_told(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     columns, _ = room_columns()

@@ -156,6 +156,7 @@ def test_spz_of_every_version(tmp_path: Path, version: int) -> None:
     assert np.allclose(1 / (1 + np.exp(-splat.opacity_logits)), wanted["opacity"], atol=1e-5)
     assert np.allclose(splat.log_scales, wanted["log_scales"])
     assert np.allclose(splat.sh[:, 1], wanted["first"])
+    assert all(array.flags.c_contiguous and array.dtype == np.float32 for array in splat.arrays().values())
     cosine = np.abs((splat.quats * wanted["quats"]).sum(axis=1)) / np.linalg.norm(splat.quats, axis=1)
     assert cosine.min() > (0.9999 if version == 3 else 0.99)  # w is the root of what three rounded squares leave
 

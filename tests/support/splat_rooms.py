@@ -10,7 +10,10 @@ from perception.io.ply import write_ply
 
 SIDES = np.array([4.0, 3.0, 2.4])
 TABLE = (np.array([1.4, 1.0, 0.0]), np.array([2.6, 2.0, 0.7]))
-BOXES = [(np.array([1.6, 1.2, 0.7]), np.array([1.9, 1.5, 1.0])), (np.array([2.1, 1.5, 0.7]), np.array([2.4, 1.8, 0.9]))]
+BOXES = [
+    (np.array([1.5, 1.1, 0.7]), np.array([1.9, 1.5, 1.1])),
+    (np.array([2.1, 1.45, 0.7]), np.array([2.5, 1.9, 1.0])),
+]
 SPACING = 0.06
 
 
