@@ -33,7 +33,7 @@ HALVED_FROM = 480
 """Long side in pixels from which silhouettes are rendered at half the resolution, at a third of the time."""
 NODE_VIEWS = 3
 """Views of each part and group that are embedded. By one crop of each, some of the many look like what is not there: a
-corner of a book like a laptop (.95; by three views .81), a group like a kettle (.98; .66)."""
+corner of a book like a laptop. Of 56 absent things 8 were answered in the demo's map, and 4 by three views."""
 
 
 @dataclass
