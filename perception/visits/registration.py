@@ -18,7 +18,7 @@ from perception.geometry import nearest_rotation, rotations
 YAWS = 12
 """Starting rotations about the vertical; the 24 that map a cube's axes to each other are tried as well."""
 ROUGH, FINE, BEST, MOST = 100, 300, 4, 1500
-"""Points of the new thing in the first rounds of all starts, in the last rounds of the BEST ones; and of the old one."""
+"""Points of the new thing in the first rounds of all starts, in the last rounds of the BEST ones; of the old one."""
 ROUNDS = (6, 25)
 TRIMMED = 0.8
 """Share of the new points that are compared: the rest are of neighbours, or were hidden in the first visit."""
