@@ -58,8 +58,9 @@ class NewPhoto:
 @dataclass(frozen=True)
 class Localised:
     """A photo's pose: camera_from_map [4, 4] float64, OpenCV axes, in the map's frame and unit. lens: known, or as
-    estimated. covariance [6, 6]: of the rotation vector about the map's axes (radians), then of the position, with the
-    map's own error. inliers: features that agree with the pose; rms_px: their error in pixels."""
+    estimated. covariance [6, 6]: of the rotation vector about the map's axes (radians), then of the position, wider
+    where the map's cameras disagree with its photos. inliers: features that agree with the pose; rms_px: their error in
+    pixels."""
 
     name: str
     photo: Path

@@ -17,8 +17,8 @@ from perception.geometry import nearest_rotation, rotations
 
 YAWS = 12
 """Starting rotations about the vertical; the 24 that map a cube's axes to each other are tried as well."""
-ROUGH, FINE, BEST = 150, 600, 4
-"""Points of the new thing in the first rounds of all starts, and in the last rounds of the BEST ones."""
+ROUGH, FINE, BEST, MOST = 100, 300, 4, 1500
+"""Points of the new thing in the first rounds of all starts, in the last rounds of the BEST ones; of the old one."""
 ROUNDS = (6, 25)
 TRIMMED = 0.8
 """Share of the new points that are compared: the rest are of neighbours, or were hidden in the first visit."""
@@ -80,7 +80,7 @@ def register(old: Points, new: Points, up: np.ndarray) -> list[tuple[float, np.n
     turns about the vertical that differ from them: points of a half hidden thing alone cannot tell."""
     from scipy.spatial import cKDTree
 
-    radius = max(old.radius, 1e-9)
+    radius, old = max(old.radius, 1e-9), old.some(MOST)
     tree = cKDTree(np.concatenate([old.points / radius, COLOUR * old.colors], axis=1))
     middle_old, middle_new = (np.median(each.points, axis=0) for each in (old, new))
     starts = []
@@ -183,7 +183,7 @@ def looks_round(points: Points, axis: np.ndarray) -> bool:
     x = points.points / max(points.radius, 1e-9)
     hues = points.colors / np.maximum(points.colors.sum(axis=1, keepdims=True), DARKEST)
     middle = np.quantile(x, [0.02, 0.98], axis=0).mean(axis=0)
-    order = np.random.default_rng(0).permutation(len(x))[: 4 * FINE]
+    order = np.random.default_rng(0).permutation(len(x))[:MOST]
     one, other = order[::2], order[1::2]
     tree = cKDTree(np.concatenate([x[one], hues[one]], axis=1))
 

@@ -13,7 +13,7 @@ from perception.cli import main
 from perception.edit.editor import Editor
 from perception.edit.scale import scaled
 from perception.errors import InputError
-from perception.map.history import Visit, date_of
+from perception.map.history import Visit, change_in, changes_of, date_of
 from perception.map.map import Map
 from perception.map.write import read_map, write_map
 from perception.query import QueryMap, load_map
@@ -206,3 +206,15 @@ def test_the_commands_say_what_changed(path: Path, capsys: pytest.CaptureFixture
     assert "visits 0 to 2" in capsys.readouterr().err
     assert main(["info", str(path)]) == 0
     assert "7 instances" in (out := capsys.readouterr().out) and "visits: 3, the newest on 2026-11-25" in out
+
+
+def test_a_round_thing_keeps_the_axis_of_its_unknown_turn_in_every_frame() -> None:
+    box = {"center": [0.0, 0, 0], "rotation": np.eye(3).tolist(), "extent": [1.0, 1, 1]}
+    spot = {"until": 0, "centroid": [1.0, 0, 0], "obb": box, "transform": np.eye(4).tolist(), "axis": [0.0, 0, 1]}
+    entry = {"id": 3, "state": "moved", "confidence": 0.9, "centroid": [0.0, 1, 0], "obb": box, "last_seen": 1}
+    visits = [Visit(0, None, "a", 3), Visit(1, None, "b", 3)]
+    (change,) = changes_of(visits, [{**entry, "num_gaussians": 5, "past": [spot]}], 0)
+    assert change["state"] == "moved" and change["axis"] == [0.0, 0, 1]
+    a_from_b = np.array([[2.0, 0, 0, 1], [0, 0, -2, 0], [0, 2, 0, 0], [0, 0, 0, 1]])  # x stays, z becomes −y
+    moved = change_in(a_from_b, change)
+    assert moved["axis"] == pytest.approx([0, -1, 0]) and moved["old_centroid"] == [3.0, 0, 0]
