@@ -54,6 +54,8 @@ INSIDE, ENCLOSED = 0.6, 0.75
 HEIGHTS, OPEN = (0.45, 1.3), 0.3
 """Heights of places in an enclosing scene, as shares of its own: a robot's or a person's eyes; and how much beyond the
 scene places are tried, which a ceiling or a lack of walls rules out."""
+HALF = 0.5
+"""Share of all directions in which a place sees surface, from which it is not outside of a wall or below the floor."""
 HORIZON = np.sin(np.radians(15))
 """Sine of the elevation below which a place of an enclosing scene sees surface: it may be open above."""
 NEAREST = 0.15
@@ -138,9 +140,9 @@ def survey(proxy: Gaussians, means: np.ndarray, up: np.ndarray | None, progress:
     places = [p for p in places if np.quantile(p.distance[p.hit], 0.02) > NEAREST * typical] or places
     rays = _rays() @ axes
     if up is None:
-        shares = np.array([p.hit.mean() for p in places])
-        inner = [p for p, share in zip(places, shares, strict=True) if share >= ENCLOSED * np.quantile(shares, 0.9)]
-        opened = 1 - np.mean([p.hit for p in inner], axis=0)
+        inner = [p for p in places if p.hit.mean() >= HALF] or places
+        roomy = np.array([np.median(p.distance[p.hit]) for p in inner])  # places in haze and under tables count less
+        opened = 1 - np.average([p.hit for p in inner], axis=0, weights=roomy)
         gravity = gravity_of(_normals_of(inner, means, VOXEL * typical), means, opened, rays)
     else:
         gravity = Gravity(-up, 0.0, "--up")

@@ -17,8 +17,10 @@ import numpy as np
 from perception.bench.output import Column, bench_parser, table
 from perception.errors import InputError
 from perception.geometry import align_similarity, camera_centres
+from perception.inputs.transforms import read_frames
 from perception.io.documents import read_json
 from perception.map.map import Map
+from perception.photos.views import make_view
 from perception.types import PointCloud
 from score.masks import evaluate_rendered
 from score.reliability import SCORED, finish_reliability, parse_pairs
@@ -72,6 +74,9 @@ def score_map(scene: Path, map_path: Path) -> dict[str, Any]:
     labels = export_labels(gmap.means, gmap.instance_ids, cloud)
     confidence = {entry["id"]: float(entry["score"]) for entry in gmap.instances}
     unseen = [view for view in gmap.views if view.held_out] or gmap.views
+    if gmap.info.get("scene", {}).get("input") == "splat":  # whose views are virtual: every 8th camera of the scene
+        cameras = sorted(read_frames(scene / "transforms.json"), key=lambda frame: frame[0])[::8]
+        unseen = [make_view(Path(name).name, Path(), lens, pose, scene) for name, pose, lens in cameras]
     rendered = evaluate_rendered(as_gaussians(gmap), gmap.instance_ids, unseen, scene / "masks_gt")
     rows = {}
     for name, ignore in (("all", None), ("things", stuff), ("stuff", ~stuff)):

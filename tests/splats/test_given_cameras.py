@@ -1,0 +1,71 @@
+"""`--cameras`: poses with and without photos, their depth of the splat, and cameras of another frame."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from perception.errors import InputError
+from perception.photos.depth import load_depth
+from perception.sfm.options import ReadOptions
+from perception.splats.cameras import pose_at
+from perception.splats.read import Splat, read_splat
+from perception.splats.scene import _cloud, _given, _with_renders, drawn
+from perception.types import View
+from support.splat_rooms import SIDES, room_columns, write_room
+
+WIDTH, HEIGHT, FOCAL = 64, 48, 50.0
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Splat:
+    return read_splat(write_room(tmp_path_factory.mktemp("room") / "room.ply", room_columns()[0]))
+
+
+def cameras_file(folder: Path, shift: float = 0.0, photos: bool = False) -> Path:
+    """A transforms.json of four level cameras in the room's middle, at half its height, with photos of grey or none."""
+    frames = []
+    for number in range(4):
+        world_from_camera = np.linalg.inv(pose_at(SIDES / 2 + [shift, 0, 0], number * np.pi / 2, 0.0, np.eye(3)))
+        opengl = world_from_camera @ np.diag([1.0, -1, -1, 1])
+        frames.append({"file_path": f"{number}.png", "transform_matrix": opengl.tolist()})
+        if photos:
+            cv2.imwrite(str(folder / f"{number}.png"), np.full((HEIGHT, WIDTH, 3), 128, np.uint8))
+    about = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2, "w": WIDTH, "h": HEIGHT}
+    file = folder / "transforms.json"
+    file.write_text(json.dumps({**about, "frames": frames}))
+    return file
+
+
+def views_of(room: Splat, cameras: Path, folder: Path) -> tuple[list[View], list[str]]:
+    options = ReadOptions(folder / "sfm", cloud=_cloud(room, room.parked))
+    given, _ = _given(cameras, options)
+    return _with_renders(given, drawn(room, room.parked, torch.zeros(len(room), 1)), folder / "frames", WIDTH, cameras)
+
+
+@pytest.mark.parametrize("photos", [False, True])
+def test_given_views_have_the_depth_of_the_walls(room: Splat, tmp_path: Path, photos: bool) -> None:
+    views, warnings = views_of(room, cameras_file(tmp_path, photos=photos), tmp_path)
+    assert len(views) == 4
+    for number, view in enumerate(views):
+        depth = load_depth(view, WIDTH, HEIGHT)
+        assert abs(np.median(depth[4:12, 28:36]) - SIDES[number % 2] / 2) < 0.05  # above the boxes, half a room ahead
+        assert (view.photo.parent == tmp_path) == photos
+        assert view.photo.is_file()
+    assert bool(warnings) == photos  # grey photos are unlike the room
+
+
+def test_cameras_of_another_frame_are_refused(room: Splat, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="of another frame"):
+        views_of(room, cameras_file(tmp_path, shift=40.0), tmp_path)
+
+
+def test_a_folder_of_photos_is_no_model(room: Splat, tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"")
+    with pytest.raises(InputError, match="expected a COLMAP workspace"):
+        views_of(room, tmp_path, tmp_path)
