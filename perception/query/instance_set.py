@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ class InstanceSet:
     ) -> None:
         self.entries, self.language = entries, language
         self._gmap, self._ids = gmap, ids
-        self._covariances: dict[int, np.ndarray] = {}
+        self._covariance = cache(self._spread)
 
     @cached_property
     def index(self) -> InstanceIndex:
@@ -66,15 +66,13 @@ class InstanceSet:
         """[I] int64: one past the last row of each entry's views."""
         return np.cumsum(self.language["view_counts"], dtype=np.int64)
 
-    def _covariance(self, row: int) -> np.ndarray:
-        """[3, 3] of the entry's points, computed once."""
-        if row not in self._covariances:
-            points = self.index.of(int(self.entries[row]["id"])).astype(np.float64)
-            centred = points - points.mean(axis=0) if len(points) else points
-            covariance = centred.T @ centred / max(len(points), 1)
-            covariance.setflags(write=False)
-            self._covariances[row] = covariance
-        return self._covariances[row]
+    def _spread(self, row: int) -> np.ndarray:
+        """[3, 3] covariance of the entry's points."""
+        points = self.index.of(int(self.entries[row]["id"])).astype(np.float64)
+        centred = points - points.mean(axis=0) if len(points) else points
+        covariance = centred.T @ centred / max(len(points), 1)
+        covariance.setflags(write=False)
+        return covariance
 
     def _colors(self, number: int) -> np.ndarray:
         """Colours [P, 3] uint8 of the points of the entry with this id, in the order of `index`; grey where it stood at

@@ -228,17 +228,14 @@ class QueryMap(Map):
             if hit.instance_id in spots and len(hits) < top_k:
                 entry, spot = spots[hit.instance_id]
                 until, seen = spot["until"], last_seen(entry, self.newest_visit)
-                then = {"last_seen": min(seen, until), "since": until + 1, "stood": self.at(until).holder(entry["id"])}
-                hits.append(replace(hit, state="removed", **then))
+                by = self.at(until).holders.get(entry["id"])
+                hits.append(replace(hit, state="removed", last_seen=min(seen, until), since=until + 1, stood=by))
         return hits
 
-    def holder(self, instance_id: int) -> tuple[str, int] | None:
-        """What holds an instance: the relation, "on", "in" or "attached to", and the other's id; None where nothing
-        does, or it is not known which way is up."""
-        return self._holders.get(instance_id)
-
     @cached_property
-    def _holders(self) -> dict[int, tuple[str, int]]:
+    def holders(self) -> dict[int, tuple[str, int]]:
+        """What holds each instance that something holds, by its id: the relation, "on", "in" or "attached to", and the
+        other's id; {} where it is not known which way is up."""
         from perception.query.scene_graph import held_by
 
         return held_by(self)

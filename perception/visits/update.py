@@ -146,6 +146,7 @@ def assembled(visit: Visit, today: Today, described: DescribedInstances, output:
         instances.append({**entry, "id": i, **state, **seen})
     with run.stage("score"):
         quality = score_views(gaussians, visit.photos.held, gmap.metric)
+        quality["views"] = {_name(name, number): figures for name, figures in quality["views"].items()}
     arrays = {name: getattr(gaussians, name).numpy() for name in TENSORS}
     fresh = slice(len(today.kept), None)
     norm = np.linalg.norm(arrays["quats"][fresh], axis=1, keepdims=True)

@@ -94,6 +94,13 @@ def test_what_stays_keeps_its_ids_and_its_geometry(world: Path, new: Map) -> Non
     assert found == old.instance_ids[stays].tolist()
 
 
+def test_scores_are_of_the_visits_own_photos_and_seconds_have_a_total(new: Map) -> None:
+    held = {view.name for view in new.views if view.held_out and view.visit == 1}
+    assert held and set(new.info["quality"]["views"]) == held
+    seconds = dict(new.info["seconds"])
+    assert seconds.pop("total") >= sum(seconds.values()) > 0
+
+
 def test_an_update_is_repeatable_and_leaves_the_old_map(world: Path, new: Map) -> None:
     before = content(world / "old.gsmap")
     updated(world, "again.gsmap")
