@@ -11,10 +11,9 @@ import numpy as np
 
 from perception.map.checksums import IGNORED
 from perception.map.history import STATES, Visit, changes_of, date_of, is_removed, visits_of
-from perception.query.hit import Hit, printed_texts
 
 if TYPE_CHECKING:
-    from perception.query import QueryMap
+    from perception.query import Hit, QueryMap
 
 
 def map_facts(path: Path | str, info: dict[str, Any]) -> dict[str, Any]:
@@ -76,7 +75,10 @@ def info_text(path: Path, info: dict[str, Any], entries: Sequence[dict[str, Any]
         lines.append("of training: " + ", ".join(f"{name} {share:.0%}" for name, share in shares(training).items()))
     if depth := info.get("depth"):
         lines.append(f"depth images: {depth['views']}, measured in {depth['measured']:.0%} of their pixels")
-    lines += [f"printed on {e['id']}: {', '.join(printed_texts(e))}" for e in entries if e.get("texts")]
+    if printed := [e for e in entries if e.get("texts")]:
+        from perception.query.hit import printed_texts
+
+        lines += [f"printed on {e['id']}: {', '.join(printed_texts(e))}" for e in printed]
     lines += [f"decision: {text}" for text in training.get("decisions", [])]
     return "\n".join([*lines, *left_out, *warnings])
 
