@@ -54,6 +54,17 @@ def test_the_hole_gets_gaussians_on_the_wall_in_the_photos_colour() -> None:
     assert float(before[centre, centre].max()) < 0.1 and float(after[centre, centre, 0].min()) > 0.25
 
 
+def test_a_hole_beside_something_near_is_filled_far_behind_it() -> None:
+    """Most of the picture shows a tree at half the depth of the wall; between the two nothing is known."""
+    gaussians = wall((-9, 0.6, -9, 9))
+    tree = wall((-0.1, 9, -9, 9))
+    tree.means /= 2
+    tree.log_scales -= np.log(2)
+    born, lacking = fill_holes(Gaussians.concatenate([gaussians, tree]), [view()], 1000, seed=1)
+    assert lacking > 0.2 and len(born) > 0
+    assert bool((born.means[:, 2] > 0.9 * DEPTH).all())
+
+
 def test_half_resolution_finds_the_empty_places_of_the_full_picture() -> None:
     """Oracle: the full picture. A third of the wall's points, finer than a pixel, leave it emptier than half; blurred
     by the 0.3 px² of larger pixels it would look covered (mean opacity .78)."""
