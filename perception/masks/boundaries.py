@@ -35,10 +35,15 @@ def boundaries(photo: PhotoCues, depth: DepthCues, layers: Layers) -> np.ndarray
     inputs = scaled(torch.from_numpy(inputs_of(photo, depth))[None])
     with torch_on_one_thread(), torch.inference_mode():  # with more, the last bits of convolutions differ
         odds = forward(layers, inputs)[0].numpy()
-    for image in (odds[0], odds[1].T):  # beyond the photo nothing is known
+    repeat_edges(odds)
+    return odds
+
+
+def repeat_edges(odds: np.ndarray) -> None:
+    """Sets the first two of log odds [C, h, w] near the edges of the photo, beyond which nothing is known, in place."""
+    for image in (odds[0], odds[1].T):
         edge = min(REACH, (image.shape[1] - 1) // 2)
         image[:, :edge], image[:, image.shape[1] - edge :] = image[:, edge, None], image[:, -edge - 1, None]
-    return odds
 
 
 def inputs_of(photo: PhotoCues, depth: DepthCues) -> np.ndarray:
@@ -90,5 +95,5 @@ def read_layers(file: Path = WEIGHTS) -> Layers:
     import torch
 
     with np.load(file) as stored:
-        parts = [torch.from_numpy(stored[f"arr_{k}"].astype(np.float32)) for k in range(2 * len(shapes()))]
+        parts = [torch.from_numpy(stored[f"arr_{k}"].astype(np.float32)) for k in range(len(stored.files))]
     return list(zip(parts[::2], parts[1::2], strict=True))

@@ -1,4 +1,4 @@
-"""`builtin`, segmentation without a neural network: stereo depth, one fused surface, and patches merged to segments.
+"""`builtin`, segmentation without models of yours: stereo depth, one fused surface, and patches merged to segments.
 
 Label ids are consistent across photos, because every photo shows the same segments of one surface.
 """
@@ -9,22 +9,28 @@ from pathlib import Path
 
 import numpy as np
 
-from perception.errors import InputError
+from perception.errors import CLASSIFIER, InputError, packaged_file
 from perception.geometry import move_points
 from perception.io.memory import Keep
 from perception.masks.base import LoadImage, MaskSource
-from perception.masks.boundaries import WEIGHTS, boundaries, read_layers
+from perception.masks.boundaries import WEIGHTS as SMALL
 from perception.masks.cues import filled
-from perception.masks.merging import Segmentation, segmentation
+from perception.masks.head import DIRECT, direct_borders, teller
+from perception.masks.head import WEIGHTS as HEAD
+from perception.masks.merging import WEIGHTS as SMALL_MERGING
+from perception.masks.merging import Segmentation, read_model, segmentation
+from perception.masks.outlines import follow_borders
 from perception.masks.stereo import StereoView, make_stereo_view, measure_depths
 from perception.masks.surface import FOOTPRINTS, Surface, SurfaceBuilder
 from perception.masks.surface_graph import SurfaceGraph, patches, voxel_edges
 from perception.progress import QUIET, Progress
 from perception.types import View
 
-VERSION = 14  # increased whenever the label images change, so that cached ones are recomputed
+VERSION = 15  # increased whenever the label images change, so that cached ones are recomputed
 _SMOOTH = 0.03  # relative to the depth: a pixel with a larger depth step is not part of the surface
 _LEAST_VOXELS = 100
+MERGING = {SMALL: SMALL_MERGING, HEAD: HEAD.with_name("head_merge_weights.npz")}
+"""Weights of learned borders, without a backbone and with it -> those of the networks that merge by them."""
 
 
 class BuiltinSegmentation(MaskSource):
@@ -40,10 +46,19 @@ class BuiltinSegmentation(MaskSource):
                 f"--masks builtin: OpenCV {cv2.__version__} has no ximgproc, so another OpenCV package hides "
                 "opencv-contrib-python-headless; uninstall the other and install that one again"
             )
-        self.name = "builtin"
-        self.identity = f"builtin {VERSION}"
-        self._voxels: dict[str, np.ndarray] = {}  # of each photo, [h, w] the voxel that each pixel shows, −1 = none
+        self.name, self.weights, self._told = "builtin", HEAD, list[str]()
+        try:
+            packaged_file(*CLASSIFIER)
+        except InputError as missing:
+            self.weights = SMALL
+            self._told = [f"masks from builtin: borders are told by a small network, less well: {missing}"]
+        self.identity = f"builtin {VERSION} {self.weights.stem}"
+        self._views: dict[str, StereoView] = {}
         self._segment = np.zeros(0, np.int32)
+
+    def check(self, views: list[View]) -> list[str]:
+        """Says if the backbone of the borders is not installed."""
+        return self._told
 
     def prepare(
         self,
@@ -59,36 +74,38 @@ class BuiltinSegmentation(MaskSource):
         if len(stereo) < 2:
             return None
         measure_depths(stereo, progress)
-        surface = fuse(stereo)
+        surface = fuse(stereo, weights=self.weights)
         if len(surface) < _LEAST_VOXELS:
             return None
-        cuts = segmentation(surface_graph(stereo, surface))
-        self._segment, self._voxels = cuts.segment, {view.name: view.voxel for view in stereo}
+        cuts = segmentation(surface_graph(stereo, surface), read_model(MERGING[self.weights]))
+        self._segment, self._views = cuts.segment, {view.name: view for view in stereo}
         return cuts
 
     def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
         """[H, W] int32 labels of `photo` [H, W, 3], after `prepare`. All 0 if the photo does not show the surface."""
         import cv2
 
-        if view.name not in self._voxels:
+        if view.name not in self._views:
             return np.zeros(photo.shape[:2], np.int32)
-        voxel = self._voxels[view.name]
-        labels = np.where(voxel >= 0, self._segment[voxel], 0)
+        seen = self._views[view.name]
+        labels = np.where(seen.voxel >= 0, self._segment[seen.voxel], 0)
         if labels.any():  # pixels off the surface take the nearest segment in the image
             labels = filled(labels, labels > 0)
+        if len(seen.learned) > DIRECT.start:
+            labels = follow_borders(labels, np.asarray(seen.learned, np.float32))
         return cv2.resize(labels, photo.shape[1::-1], interpolation=cv2.INTER_NEAREST)
 
 
-def fuse(views: list[StereoView], side: float = FOOTPRINTS, weights: Path = WEIGHTS) -> Surface:
+def fuse(views: list[StereoView], side: float = FOOTPRINTS, weights: Path = SMALL) -> Surface:
     """Fuses the confirmed pixels of all photos into one surface. side: of a voxel, in pixel footprints; weights: of
     learned borders."""
-    layers = read_layers(weights)
+    tell = teller(weights)
     footprints = np.concatenate([(view.depth[::4, ::4] / view.K[0, 0]).ravel() for view in views])
     builder = SurfaceBuilder(side * float(np.median(footprints)))
     for view in views:
         photo, depth = view.cues()
-        view.learned = view.keep(boundaries(photo, depth, layers).astype(np.float16))
-        border = 1 / (1 + np.exp(-view.learned[:2].max(axis=0).astype(np.float32)))
+        view.learned = view.keep(tell(view.photo, photo, depth).astype(np.float16))
+        border = 1 / (1 + np.exp(-direct_borders(np.asarray(view.learned, np.float32)).max(axis=0)))
         known = view.confirmed & (depth.step.max(axis=0) < _SMOOTH)
         builder.add(photo, depth, border, known, view.world_from_camera)
     return builder.build()

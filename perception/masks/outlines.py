@@ -1,0 +1,55 @@
+"""Label images whose outlines follow the learned borders of the photo, rather than the voxels of the surface."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from perception.masks.head import DIRECT
+
+BAND = 6.0  # pixels to either side of an outline within which it is moved
+_STEP = 0.05  # cost of one pixel, beside a border's probability: without borders the outline is in the middle
+_CORE = 0.5  # share of the half width of a narrow region that keeps its label
+
+
+def follow_borders(labels: np.ndarray, learned: np.ndarray) -> np.ndarray:
+    """labels: [h, w] int; learned: [11, h, w] log odds, see `head.borders`. Pixels near outlines take the label to
+    which the cheapest path leads; a path costs the probabilities of the borders that it crosses. Every connected
+    region keeps its core, so none is lost."""
+    from scipy.ndimage import maximum
+    from scipy.sparse.csgraph import connected_components, dijkstra
+
+    index = np.arange(labels.size).reshape(labels.shape)
+    flat = labels.ravel()
+    before = np.concatenate([index[:, :-1].ravel(), index[:-1].ravel()])
+    after = np.concatenate([index[:, 1:].ravel(), index[1:].ravel()])
+    odds = np.concatenate([learned[DIRECT.start, :, :-1].ravel(), learned[DIRECT.start + 1, :-1].ravel()])
+    cut = flat[before] != flat[after]
+    if not cut.any():
+        return labels
+    inner = _inner(labels, before[cut], after[cut])
+    count, region = connected_components(_graph(before[~cut], after[~cut], np.ones((~cut).sum()), labels.size), False)
+    widest = maximum(inner, region, np.arange(count))
+    moved = inner < np.minimum(BAND, _CORE * widest[region])
+    within = moved[before] | moved[after]
+    costs = _STEP + 1 / (1 + np.exp(-odds[within].astype(np.float64)))
+    graph = _graph(before[within], after[within], costs, labels.size)
+    cores = np.unique(np.concatenate([before[within], after[within]]))
+    sources = dijkstra(graph, False, cores[~moved[cores]], min_only=True, return_predecessors=True)[2]
+    found = np.where(moved & (sources >= 0), flat[np.maximum(sources, 0)], flat)
+    return found.reshape(labels.shape).astype(labels.dtype)
+
+
+def _inner(labels: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """[h · w] distance of each pixel from the outlines, in pixels; 0 beside one."""
+    import cv2
+
+    away = np.ones(labels.size, np.uint8)
+    away[before] = away[after] = 0
+    return np.asarray(cv2.distanceTransform(away.reshape(labels.shape), cv2.DIST_L2, 5)).ravel()
+
+
+def _graph(before: np.ndarray, after: np.ndarray, costs: np.ndarray, count: int):  # type: ignore[no-untyped-def]
+    """Sparse matrix [count, count] of the costs of edges."""
+    from scipy.sparse import csr_array
+
+    return csr_array((costs, (before, after)), (count, count))

