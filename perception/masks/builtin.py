@@ -15,8 +15,8 @@ from perception.io.memory import Keep
 from perception.masks.base import LoadImage, MaskSource
 from perception.masks.boundaries import WEIGHTS as SMALL
 from perception.masks.cues import filled
-from perception.masks.head import DIRECT, direct_borders, teller
 from perception.masks.head import WEIGHTS as HEAD
+from perception.masks.head import direct_borders, teller
 from perception.masks.merging import WEIGHTS as SMALL_MERGING
 from perception.masks.merging import Segmentation, read_model, segmentation
 from perception.masks.outlines import follow_borders
@@ -46,13 +46,14 @@ class BuiltinSegmentation(MaskSource):
                 f"--masks builtin: OpenCV {cv2.__version__} has no ximgproc, so another OpenCV package hides "
                 "opencv-contrib-python-headless; uninstall the other and install that one again"
             )
-        self.name, self.weights, self._told = "builtin", HEAD, list[str]()
+        self.name, self.weights, self._told = "builtin", SMALL, list[str]()
         try:
             packaged_file(*CLASSIFIER)
+            self._outlines: Path | None = HEAD
         except InputError as missing:
-            self.weights = SMALL
-            self._told = [f"masks from builtin: borders are told by a small network, less well: {missing}"]
-        self.identity = f"builtin {VERSION} {self.weights.stem}"
+            self._outlines = None
+            self._told = [f"masks from builtin: labels do not follow the borders that a backbone sees: {missing}"]
+        self.identity = f"builtin {VERSION} {self.weights.stem} {self._outlines and self._outlines.stem}"
         self._views: dict[str, StereoView] = {}
         self._segment = np.zeros(0, np.int32)
 
@@ -89,10 +90,11 @@ class BuiltinSegmentation(MaskSource):
             return np.zeros(photo.shape[:2], np.int32)
         seen = self._views[view.name]
         labels = np.where(seen.voxel >= 0, self._segment[seen.voxel], 0)
-        if labels.any():  # pixels off the surface take the nearest segment in the image
-            labels = filled(labels, labels > 0)
-        if len(seen.learned) > DIRECT.start:
-            labels = follow_borders(labels, np.asarray(seen.learned, np.float32))
+        known = labels > 0
+        if known.any():  # pixels off the surface take the nearest segment in the image
+            labels = filled(labels, known)
+        if known.any() and self._outlines is not None:
+            labels = follow_borders(labels, known, teller(self._outlines)(seen.photo, *seen.cues()))
         return cv2.resize(labels, photo.shape[1::-1], interpolation=cv2.INTER_NEAREST)
 
 

@@ -1,4 +1,4 @@
-"""Label images whose outlines follow the learned borders of the photo, rather than the voxels of the surface."""
+"""Label images that follow the learned borders of the photo where the surface tells nothing, and at its outlines."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ import numpy as np
 
 from perception.masks.head import DIRECT
 
-BAND = 6.0  # pixels to either side of an outline within which it is moved
+BAND = 1.0  # pixels to either side of an outline within which it is moved
 _STEP = 0.05  # cost of one pixel, beside a border's probability: without borders the outline is in the middle
 _CORE = 0.5  # share of the half width of a narrow region that keeps its label
 
 
-def follow_borders(labels: np.ndarray, learned: np.ndarray) -> np.ndarray:
-    """labels: [h, w] int; learned: [11, h, w] log odds, see `head.borders`. Pixels near outlines take the label to
-    which the cheapest path leads; a path costs the probabilities of the borders that it crosses. Every connected
-    region keeps its core, so none is lost."""
+def follow_borders(labels: np.ndarray, known: np.ndarray, learned: np.ndarray) -> np.ndarray:
+    """labels: [h, w] int; known: [h, w] bool, pixels whose label is more than that of the nearest one; learned:
+    [11, h, w] log odds, see `head.borders`. Pixels near outlines, and those not known, take the label to which the
+    cheapest path leads; a path costs the probabilities of the borders that it crosses. Every connected region of known
+    pixels keeps its core, so none is lost."""
     from scipy.ndimage import maximum
     from scipy.sparse.csgraph import connected_components, dijkstra
 
@@ -23,13 +24,14 @@ def follow_borders(labels: np.ndarray, learned: np.ndarray) -> np.ndarray:
     before = np.concatenate([index[:, :-1].ravel(), index[:-1].ravel()])
     after = np.concatenate([index[:, 1:].ravel(), index[1:].ravel()])
     odds = np.concatenate([learned[DIRECT.start, :, :-1].ravel(), learned[DIRECT.start + 1, :-1].ravel()])
-    cut = flat[before] != flat[after]
-    if not cut.any():
+    sure = known.ravel()
+    cut = (flat[before] != flat[after]) | (sure[before] != sure[after])
+    if not sure.any() or (sure.all() and not cut.any()):
         return labels
     inner = _inner(labels, before[cut], after[cut])
     count, region = connected_components(_graph(before[~cut], after[~cut], np.ones((~cut).sum()), labels.size), False)
     widest = maximum(inner, region, np.arange(count))
-    moved = inner < np.minimum(BAND, _CORE * widest[region])
+    moved = ~sure | (inner < np.minimum(BAND, _CORE * widest[region]))
     within = moved[before] | moved[after]
     costs = _STEP + 1 / (1 + np.exp(-odds[within].astype(np.float64)))
     graph = _graph(before[within], after[within], costs, labels.size)

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from perception.masks.boundaries import Layers
     from perception.masks.stereo import StereoView
 
-STEPS, BATCH, RATE = 600, 6, 3e-3
+STEPS, BATCH, RATE = 425, 6, 3e-3
+CYCLE, FALL = 600, 100  # steps: of the schedule of the rate, and the last ones, in which it falls to 0
 CROP, GRID = (160, 224), 32  # of a photo, in pixels; its place, which the maps of all strides share
 COPIES = 3  # of each photo, in other light
 STUFF = 1 << 14  # added to the ids of floors, walls and tables
@@ -105,7 +106,7 @@ def train(photos: Photos, seed: int, aside: Path, steps: int = STEPS) -> Layers:
     ]
     parts = [part for layer in layers for part in layer]
     optimiser = torch.optim.AdamW(parts, weight_decay=1e-3)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=steps)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=max(CYCLE, steps))
     first = _restored(aside, parts, optimiser, schedule)
     weights = torch.tensor([0.25] * OUTPUTS)
     weights = torch.cat([weights, torch.ones(2)])  # borders between neighbours also at the photos' resolution
@@ -121,6 +122,8 @@ def train(photos: Photos, seed: int, aside: Path, steps: int = STEPS) -> Layers:
         optimiser.zero_grad()
         (losses @ weights).backward()
         torch.nn.utils.clip_grad_norm_(parts, 1.0)
+        for group in optimiser.param_groups:  # set anew by the schedule
+            group["lr"] *= min(1.0, (steps - step) / FALL)
         optimiser.step()
         schedule.step()
         if step % SAVED == SAVED - 1:
