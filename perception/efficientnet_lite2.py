@@ -96,7 +96,7 @@ def load_backbone(weights: Path) -> EfficientNetLite2:
     from torch.nn.utils.fusion import fuse_conv_bn_eval
 
     model = load_network(weights)
-    pairs = [(model, "_conv_stem", "_bn0")]
+    pairs: list[tuple[nn.Module, str, str]] = [(model, "_conv_stem", "_bn0")]
     for block in model._blocks:
         pairs += [(block, "_depthwise_conv", "_bn1"), (block, "_project_conv", "_bn2")]
         pairs += [(block, "_expand_conv", "_bn0")] if block.expands else []
