@@ -35,15 +35,10 @@ def boundaries(photo: PhotoCues, depth: DepthCues, layers: Layers) -> np.ndarray
     inputs = scaled(torch.from_numpy(inputs_of(photo, depth))[None])
     with torch_on_one_thread(), torch.inference_mode():  # with more, the last bits of convolutions differ
         odds = forward(layers, inputs)[0].numpy()
-    repeat_edges(odds)
-    return odds
-
-
-def repeat_edges(odds: np.ndarray) -> None:
-    """Sets the first two of log odds [C, h, w] near the edges of the photo, beyond which nothing is known, in place."""
-    for image in (odds[0], odds[1].T):
+    for image in (odds[0], odds[1].T):  # beyond the photo nothing is known
         edge = min(REACH, (image.shape[1] - 1) // 2)
         image[:, :edge], image[:, image.shape[1] - edge :] = image[:, edge, None], image[:, -edge - 1, None]
+    return odds
 
 
 def inputs_of(photo: PhotoCues, depth: DepthCues) -> np.ndarray:
@@ -91,7 +86,7 @@ def forward(layers: Layers, inputs: torch.Tensor) -> torch.Tensor:
 
 @functools.cache
 def read_layers(file: Path = WEIGHTS) -> Layers:
-    """The layers of the package, or of another file of `tools/training/masks.py`."""
+    """The layers of the package, or of another file of `tools/training`; also those of `head`."""
     import torch
 
     with np.load(file) as stored:

@@ -13,12 +13,11 @@ from perception.errors import CLASSIFIER, InputError, packaged_file
 from perception.geometry import move_points
 from perception.io.memory import Keep
 from perception.masks.base import LoadImage, MaskSource
-from perception.masks.boundaries import WEIGHTS as SMALL
+from perception.masks.boundaries import WEIGHTS, boundaries, read_layers
 from perception.masks.cues import filled
 from perception.masks.head import WEIGHTS as HEAD
-from perception.masks.head import direct_borders, teller
-from perception.masks.merging import WEIGHTS as SMALL_MERGING
-from perception.masks.merging import Segmentation, read_model, segmentation
+from perception.masks.head import borders
+from perception.masks.merging import Segmentation, segmentation
 from perception.masks.outlines import follow_borders
 from perception.masks.stereo import StereoView, make_stereo_view, measure_depths
 from perception.masks.surface import FOOTPRINTS, Surface, SurfaceBuilder
@@ -29,8 +28,6 @@ from perception.types import View
 VERSION = 15  # increased whenever the label images change, so that cached ones are recomputed
 _SMOOTH = 0.03  # relative to the depth: a pixel with a larger depth step is not part of the surface
 _LEAST_VOXELS = 100
-MERGING = {SMALL: SMALL_MERGING, HEAD: HEAD.with_name("head_merge_weights.npz")}
-"""Weights of learned borders, without a backbone and with it -> those of the networks that merge by them."""
 
 
 class BuiltinSegmentation(MaskSource):
@@ -46,19 +43,18 @@ class BuiltinSegmentation(MaskSource):
                 f"--masks builtin: OpenCV {cv2.__version__} has no ximgproc, so another OpenCV package hides "
                 "opencv-contrib-python-headless; uninstall the other and install that one again"
             )
-        self.name, self.weights, self._told = "builtin", SMALL, list[str]()
+        self.name, self._follows, self._told = "builtin", True, list[str]()
         try:
             packaged_file(*CLASSIFIER)
-            self._outlines: Path | None = HEAD
         except InputError as missing:
-            self._outlines = None
+            self._follows = False
             self._told = [f"masks from builtin: labels do not follow the borders that a backbone sees: {missing}"]
-        self.identity = f"builtin {VERSION} {self.weights.stem} {self._outlines and self._outlines.stem}"
+        self.identity = f"builtin {VERSION}" + (" with backbone" if self._follows else "")
         self._views: dict[str, StereoView] = {}
         self._segment = np.zeros(0, np.int32)
 
     def check(self, views: list[View]) -> list[str]:
-        """Says if the backbone of the borders is not installed."""
+        """Says if the backbone of `head` is not installed."""
         return self._told
 
     def prepare(
@@ -75,10 +71,10 @@ class BuiltinSegmentation(MaskSource):
         if len(stereo) < 2:
             return None
         measure_depths(stereo, progress)
-        surface = fuse(stereo, weights=self.weights)
+        surface = fuse(stereo)
         if len(surface) < _LEAST_VOXELS:
             return None
-        cuts = segmentation(surface_graph(stereo, surface), read_model(MERGING[self.weights]))
+        cuts = segmentation(surface_graph(stereo, surface))
         self._segment, self._views = cuts.segment, {view.name: view for view in stereo}
         return cuts
 
@@ -93,21 +89,21 @@ class BuiltinSegmentation(MaskSource):
         known = labels > 0
         if known.any():  # pixels off the surface take the nearest segment in the image
             labels = filled(labels, known)
-        if known.any() and self._outlines is not None:
-            labels = follow_borders(labels, known, teller(self._outlines)(seen.photo, *seen.cues()))
+        if known.any() and self._follows:  # or the one that they reach without crossing a border
+            labels = follow_borders(labels, known, borders(seen.photo, *seen.cues(), read_layers(HEAD)))
         return cv2.resize(labels, photo.shape[1::-1], interpolation=cv2.INTER_NEAREST)
 
 
-def fuse(views: list[StereoView], side: float = FOOTPRINTS, weights: Path = SMALL) -> Surface:
+def fuse(views: list[StereoView], side: float = FOOTPRINTS, weights: Path = WEIGHTS) -> Surface:
     """Fuses the confirmed pixels of all photos into one surface. side: of a voxel, in pixel footprints; weights: of
     learned borders."""
-    tell = teller(weights)
+    layers = read_layers(weights)
     footprints = np.concatenate([(view.depth[::4, ::4] / view.K[0, 0]).ravel() for view in views])
     builder = SurfaceBuilder(side * float(np.median(footprints)))
     for view in views:
         photo, depth = view.cues()
-        view.learned = view.keep(tell(view.photo, photo, depth).astype(np.float16))
-        border = 1 / (1 + np.exp(-direct_borders(np.asarray(view.learned, np.float32)).max(axis=0)))
+        view.learned = view.keep(boundaries(photo, depth, layers).astype(np.float16))
+        border = 1 / (1 + np.exp(-view.learned[:2].max(axis=0).astype(np.float32)))
         known = view.confirmed & (depth.step.max(axis=0) < _SMOOTH)
         builder.add(photo, depth, border, known, view.world_from_camera)
     return builder.build()

@@ -1,14 +1,14 @@
 """Learned borders on the feature maps of a network that has seen photos of the world (EfficientNet-Lite2, ImageNet).
 
-The network is frozen; its maps, and the same inputs as those of `boundaries`, go into a small head. It tells the three
-things that `boundaries` tells, and more: borders between neighbouring pixels, and whether pixels farther apart are of
-different things. `python tools training.masks` makes the packaged weights, see docs/masks.md.
+The network is frozen; its maps, and the same inputs as those of `boundaries`, go into a small head. It tells what
+`boundaries` tells, and borders between neighbouring pixels. `python tools training.heads` makes the packaged weights
+from rendered worlds alone, see docs/masks.md.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from perception.errors import CLASSIFIER, packaged_file
 from perception.machine import torch_on_one_thread
-from perception.masks.boundaries import INPUTS, WIDTHS, boundaries, inputs_of, read_layers, repeat_edges, scaled
+from perception.masks.boundaries import INPUTS, WIDTHS, inputs_of, scaled
 from perception.masks.cues import DepthCues, PhotoCues
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from perception.masks.boundaries import Layers
 
 WEIGHTS = Path(__file__).with_name("head_weights.npz")
-NEAR, THING, DIRECT, FAR = slice(0, 2), 2, slice(3, 5), slice(5, 11)  # outputs
+THING, DIRECT = 2, slice(3, 5)  # outputs
 OFFSETS = {0: (4, 0), 1: (0, 4), 5: (3, 3), 6: (3, -3), 7: (12, 0), 8: (0, 12), 9: (8, 8), 10: (8, -8)}
 """Output -> (x, y): whether the pixels this far to either side are of different things."""
 OUTPUTS = 11
@@ -35,8 +35,9 @@ PROJECTED = (16, 24, 24, 24, 24)  # channels that each of them is reduced to
 
 
 def borders(rgb: np.ndarray, photo: PhotoCues, depth: DepthCues, layers: Layers) -> np.ndarray:
-    """[11, h, w] float32 log odds. 0 to 2: see `boundaries`. 3 and 4: that a pixel and its right neighbour, its lower
-    one, are of different things. The rest: see OFFSETS. rgb: [h, w, 3] uint8."""
+    """[11, h, w] float32 log odds. THING: that a pixel is of a thing and not of a floor, a wall or a table. DIRECT:
+    that a pixel and its right neighbour, its lower one, are of different things. The rest: see OFFSETS. rgb: [h, w, 3]
+    uint8."""
     return predicted(rgb, inputs_of(photo, depth), layers)
 
 
@@ -47,29 +48,7 @@ def predicted(rgb: np.ndarray, inputs: np.ndarray, layers: Layers) -> np.ndarray
     with torch_on_one_thread(), torch.inference_mode():  # with more, the last bits of convolutions differ
         maps = backbone().maps(torch.from_numpy(np.ascontiguousarray(rgb))[None])
         shown = scaled(torch.from_numpy(inputs)[None])
-        odds = enlarged(forward(layers, shown, maps), shown)[0].numpy()
-    repeat_edges(odds)
-    return odds
-
-
-def direct_borders(learned: np.ndarray) -> np.ndarray:
-    """[2, h, w] log odds of a border between a pixel and the next one, the largest within 2 pixels along the axis,
-    since voxels do not end at the pixel where a thing does. Where it is not told, that of pixels farther apart."""
-    import cv2
-
-    if len(learned) <= DIRECT.start:
-        return learned[:2]
-    lines = np.ones((1, 5), np.uint8), np.ones((5, 1), np.uint8)
-    return np.stack([cv2.dilate(image, line) for image, line in zip(learned[DIRECT], lines, strict=True)])
-
-
-def teller(file: Path) -> Callable[[np.ndarray, PhotoCues, DepthCues], np.ndarray]:
-    """What tells borders by the weights in `file`: (rgb, photo, depth) -> [11, h, w], see `borders`, or the first three
-    of them where they are those of `boundaries`."""
-    layers = read_layers(file)
-    if len(layers) == len(shapes()):
-        return functools.partial(borders, layers=layers)
-    return lambda _, photo, depth: boundaries(photo, depth, layers)
+        return enlarged(forward(layers, shown, maps), shown)[0].numpy()
 
 
 @functools.cache

@@ -16,15 +16,10 @@ from perception.masks.surface_graph import (
     CONTACT,
     CONVEX,
     DEPTH,
-    DIRECT,
     EDGE,
-    FAR,
-    FARS,
     LAB,
     LEARNED,
     LENGTH,
-    NEAR,
-    NEARS,
     NORMAL,
     PIXELS,
     POINT,
@@ -45,14 +40,13 @@ PAIR_FEATURES = (
     "crease_of_flat", "concave_of_flat", "edge_in_plane", "flat_out_of_plane",
     "distance", "thickness_growth", "width_growth", "length_growth", "larger_thickness", "larger_width",
     "larger_length", "smaller_thickness", "smaller_width", "smaller_length", "volume_growth",
-    "learned", "thing_difference", "direct", "near", "far",
+    "learned", "thing_difference",
 )  # fmt: skip
 """Columns of `pair_features`, in the order of the trained weights; the code says what each is."""
 
 REGION_FEATURES = (
     "area", "thickness", "width", "length", "edge", "sharp", "step", "broken", "concave", "convex", "learned",
-    "direct", "near", "far", "contact", "neighbours", "texture", "thing", "colours", "next_size", "next_contact",
-    "pixels",
+    "contact", "neighbours", "texture", "thing", "colours", "next_size", "next_contact", "pixels",
 )  # fmt: skip
 """Columns of `region_features`, in the order of the trained weights."""
 
@@ -64,7 +58,7 @@ _LEAST_EXTENT = 0.25  # voxel sides: lower limit of extents of pairs, so that th
 
 
 def pair_features(graph: SurfaceGraph, pairs: np.ndarray) -> np.ndarray:
-    """[M, 39] for the decision whether the two patches of each of pairs [M, 2] are one object."""
+    """[M, 36] for the decision whether the two patches of each of pairs [M, 2] are one object."""
     border = np.stack([graph.borders[a][b] for a, b in pairs.tolist()])
     length = border[:, LENGTH]
     one, two = graph.sums[pairs[:, 0]], graph.sums[pairs[:, 1]]
@@ -85,10 +79,6 @@ def pair_features(graph: SurfaceGraph, pairs: np.ndarray) -> np.ndarray:
         "concave_border": border[:, CONCAVE] / length,  # cosine-like: where a thing stands on another
         "convex_border": border[:, CONVEX] / length,  # cosine-like: an edge of one thing
         "learned": border[:, LEARNED] / length,  # log odds of the network of borders
-        "direct": border[:, DIRECT] / length,  # those between neighbouring pixels
-        # Means over pairs of pixels in both: log odds that they are of different things
-        "near": border[:, NEAR] / np.maximum(border[:, NEARS], 1),
-        "far": border[:, FAR] / np.maximum(border[:, FARS], 1),
         # Pairs of touching voxels
         "contact_share": border[:, CONTACT] / graph.contacts[pairs].min(axis=1),  # of all of the patch with fewer
         "contact": np.log(border[:, CONTACT] * graph.surface.size / depth) + 2,  # logarithm of their length
@@ -168,12 +158,11 @@ def _shape_features(
 
 
 def region_features(graph: SurfaceGraph, a: int, sibling: int | None) -> np.ndarray:
-    """[22] for the decision whether region `a` is an object. sibling: the one that it would be merged with next."""
+    """[19] for the decision whether region `a` is an object. sibling: the one that it would be merged with next."""
     sums, links = graph.sums[a], graph.borders[a]
     voxels, pixels, depth = sums[VOXELS], max(sums[PIXELS], 1), max(graph.depth(a), 1e-9)
     border = sum(links.values(), np.zeros(CONTACT + 1))  # of all its borders together
-    border_means = border[EDGE:NEARS] / max(border[LENGTH], 1)
-    apart = border[[NEAR, FAR]] / np.maximum(border[[NEARS, FARS]], 1)
+    border_means = border[EDGE:CONTACT] / max(border[LENGTH], 1)
     colours = sums[COLOURS] / pixels
     extents = np.maximum(graph.extents[a] / depth, 1e-3)
     next_size = next_contact = 0.0
@@ -185,8 +174,7 @@ def region_features(graph: SurfaceGraph, a: int, sibling: int | None) -> np.ndar
         [
             np.log(max(graph.area(a), 1e-7)),  # area, over squared depth
             *np.log(extents),  # thickness, width, length, over depth
-            *border_means,  # edge, sharp, step, broken, concave, convex, learned, direct, as of pairs, but no logarithm
-            *apart,  # near, far
+            *border_means,  # edge, sharp, step, broken, concave, convex, learned, as those of pairs, but no logarithm
             np.log1p(border[CONTACT]) - np.log(voxels) / 2,  # contact, relative to √voxels, as a round patch has it
             len(links),  # neighbours
             sums[TEXTURE] / pixels,  # texture, mean log gradient

@@ -103,8 +103,10 @@ class Segmentation:
     group_probability: np.ndarray
 
 
-def segmentation(graph: SurfaceGraph, model: MergeModel) -> Segmentation:
-    """The cuts at the model's cost of an object, at PART_COST of it, and at GROUP_COST; such cuts are nested."""
+def segmentation(graph: SurfaceGraph) -> Segmentation:
+    """The cuts with the packaged model, at its cost of an object, at PART_COST of it, and at GROUP_COST; such cuts are
+    nested."""
+    model = read_model()
     tree = tree_by(model, graph)
     segment, probability = divided(graph, tree, model)
     p, calibrated = model.probabilities(tree)

@@ -13,7 +13,6 @@ import numpy as np
 from perception import _core
 from perception.geometry import sums_by
 from perception.masks.cues import COLOUR_BINS, DepthCues, PhotoCues
-from perception.masks.head import OFFSETS, direct_borders
 from perception.masks.surface import Surface, position_in
 
 NEIGHBOURS = 8  # nearest voxels that a voxel can touch
@@ -40,10 +39,9 @@ PRODUCTS = slice(13, 19)
 COLOURS = slice(19, 19 + COLOUR_BINS)
 THING = COLOURS.stop
 # Columns of the sums over the pixels at the border of two patches: their number, gradient of the photo, number with one
-# over SHARP, steps up to LARGEST_STEP over it, number with one over STEP, bend towards and away from the camera, log
-# odds of a learned border, and those between neighbouring pixels; then sums over pairs of pixels, one in each patch, 8
-# pixels apart or 24: their number, and log odds that they are of different things; last the pairs of touching voxels.
-LENGTH, EDGE, SHARPS, STEPS, BROKEN, CONCAVE, CONVEX, LEARNED, DIRECT, NEARS, NEAR, FARS, FAR, CONTACT = range(14)
+# over SHARP, steps up to LARGEST_STEP over it, number with one over STEP, bend towards and away from the camera, and
+# log odds of a learned border; last the number of pairs of touching voxels.
+LENGTH, EDGE, SHARPS, STEPS, BROKEN, CONCAVE, CONVEX, LEARNED, CONTACT = range(9)
 _UPPER = np.triu_indices(3)
 
 
@@ -95,9 +93,8 @@ class SurfaceGraph:
         self.borders: list[dict[int, np.ndarray]] = []
 
     def add(self, regions: np.ndarray, photo: PhotoCues, depth: DepthCues, learned: np.ndarray) -> None:
-        """Adds the evidence of one photo. regions: [h, w] patch of each pixel, −1 = none; learned: [3 or 11, h, w], see
-        `perception.masks.head`."""
-        sharp = direct_borders(learned)
+        """Adds the evidence of one photo. regions: [h, w] patch of each pixel, −1 = none; learned: [3, h, w], see
+        `perception.masks.boundaries.boundaries`."""
         inside = regions >= 0
         flat = regions[inside]
         z = depth.points[..., 2]
@@ -115,27 +112,10 @@ class SurfaceGraph:
             step, bend, odds = (neighbours(maps[axis], axis)[0][cut] for maps in (depth.step, depth.bend, learned))
             columns = [np.ones(len(edge)), edge, edge > SHARP]
             columns += [np.minimum(step, LARGEST_STEP) / LARGEST_STEP, step > STEP]
-            columns += [np.clip(-bend, 0, 1), np.clip(bend, 0, 1), odds, neighbours(sharp[axis], axis)[0][cut]]
+            columns += [np.clip(-bend, 0, 1), np.clip(bend, 0, 1), odds]
             touching = border >= 0
             values = np.stack(columns, axis=1)[touching]
-            self._border[:, :NEARS] += sums_by(border[touching], values, len(self._keys))
-        self._add_distant(regions, learned)
-
-    def _add_distant(self, regions: np.ndarray, learned: np.ndarray) -> None:
-        """Adds what was learned of pixels that lie in two patches, at all OFFSETS that are told."""
-        h, w = regions.shape
-        for k, (x, y) in OFFSETS.items():
-            up = abs(y)
-            if k >= len(learned) or h <= 2 * up or w <= 2 * x:
-                continue
-            first, second = regions[up - y : h - up - y, : w - 2 * x], regions[up + y : h - up + y, 2 * x :]
-            cut = (first != second) & (first >= 0) & (second >= 0)
-            low, high = np.minimum(first, second)[cut].astype(np.int64), np.maximum(first, second)[cut]
-            border = position_in(self._keys, low * self.count + high)
-            odds, count = learned[k, up : h - up, x : w - x][cut][border >= 0], len(self._keys)
-            column = NEARS if max(x, up) <= 4 else FARS
-            self._border[:, column] += np.bincount(border[border >= 0], minlength=count)
-            self._border[:, column + 1] += np.bincount(border[border >= 0], odds, count)
+            self._border[:, :CONTACT] += sums_by(border[touching], values, len(self._keys))
 
     def link(self) -> None:
         """Builds `borders`. Call it after all photos are added."""

@@ -202,8 +202,8 @@ def test_fused_surface_lies_on_the_parts():
 
 
 def test_merging_patches_keeps_the_evidence_exact():
-    """After merging, all sums equal those of a graph built from the merged patches; contacts and pairs of distant
-    pixels, which some borders have that no photo shows, those of the borders that are shown."""
+    """After merging, all sums equal those of a graph built from the merged patches; contacts, which no photo shows at
+    some borders, those of the borders that are shown."""
     seen = true_views()[:3]
     surface = fuse(seen)
     edges = voxel_edges(surface)
@@ -234,7 +234,7 @@ def test_merging_patches_keeps_the_evidence_exact():
     for i, a in enumerate(kept):
         for j in fresh.borders[i]:
             old, new = (pair_features(g, np.array([pair]))[0] for g, pair in ((first, (a, kept[j])), (fresh, (i, j))))
-            of_contacts = [PAIR_FEATURES.index(name) for name in ("contact_share", "contact", "near", "far")]
+            of_contacts = [PAIR_FEATURES.index(name) for name in ("contact_share", "contact")]
             np.testing.assert_allclose(np.delete(old, of_contacts), np.delete(new, of_contacts), atol=1e-6)
             assert first.borders[a][kept[j]][CONTACT] == contacts[into == a][:, into == kept[j]].sum()
             compared += 1
@@ -401,7 +401,7 @@ def test_cuts_of_rising_cost_are_nested():
 
 def test_parts_lie_in_segments_and_probabilities_belong_to_them():
     seen = true_views()[:3]
-    cuts = segmentation(surface_graph(seen, fuse(seen)), read_model())
+    cuts = segmentation(surface_graph(seen, fuse(seen)))
     assert all(len(np.unique(cuts.segment[cuts.part == k])) == 1 for k in range(len(cuts.part_probability)))
     assert cuts.part.max() + 1 == len(cuts.part_probability) and cuts.group.max() + 1 == len(cuts.group_probability)
     assert len(cuts.group) == len(cuts.probability) == cuts.segment.max() + 1 and len(cuts.points) == len(cuts.segment)

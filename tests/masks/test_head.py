@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
-from types import SimpleNamespace
 
 import cv2
 import networkx as nx
@@ -16,7 +15,6 @@ from scipy.signal import correlate
 from perception.masks import head, make_source
 from perception.masks.boundaries import INPUTS, WIDTHS, scaled
 from perception.masks.outlines import _STEP, BAND, follow_borders
-from perception.masks.surface_graph import FAR, FARS, NEAR, NEARS, SurfaceGraph
 
 
 def layers_of(seed: int) -> head.Layers:
@@ -154,25 +152,3 @@ def test_outlines_are_where_the_cheapest_paths_meet_and_narrow_regions_stay():
         else:
             costs = {label: reach[label][pixel] for label in reach}
             assert costs[found[pixel]] == pytest.approx(min(costs.values()))
-
-
-def test_evidence_of_distant_pixels_against_each_pair_of_pixels():
-    rng = np.random.default_rng(4)
-    regions = np.repeat(np.repeat(rng.integers(-1, 4, (4, 5)), 8, axis=0), 8, axis=1)
-    learned = rng.normal(0, 2, (head.OUTPUTS, *regions.shape)).astype(np.float32)
-    pairs = list(itertools.combinations(range(4), 2))
-    graph = SimpleNamespace(count=4, _keys=np.array([a * 4 + b for a, b in pairs]), _border=np.zeros((len(pairs), 14)))
-    SurfaceGraph._add_distant(graph, regions, learned)  # type: ignore[arg-type]
-    expected = np.zeros((len(pairs), 14))
-    for k, (dx, dy) in head.OFFSETS.items():
-        for y, x in itertools.product(*map(range, regions.shape)):
-            ends = [(y - dy, x - dx), (y + dy, x + dx)]
-            if not all(0 <= v < regions.shape[0] and 0 <= u < regions.shape[1] for v, u in ends):
-                continue
-            a, b = sorted(int(regions[end]) for end in ends)
-            if a >= 0 and a != b:
-                row = expected[pairs.index((a, b))]
-                count, odds = (NEARS, NEAR) if max(dx, abs(dy)) <= 4 else (FARS, FAR)
-                row[count] += 1
-                row[odds] += learned[k, y, x]
-    np.testing.assert_allclose(graph._border, expected, atol=1e-9)

@@ -1,7 +1,17 @@
-"""Trains the head of `perception.masks.head` on the frozen network's maps; `python tools training.masks` calls it."""
+"""Trains the head of borders on the maps of a frozen ImageNet network.
+
+python tools training.heads WORK
+
+Worlds are those of `training.masks` and three of `training.crowds` in each set. The packaged weights are those of one
+set. WORK keeps the worlds and the state, so that a run that was stopped goes on. Equal seeds give equal weights.
+"""
 
 from __future__ import annotations
 
+import argparse
+import os
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,13 +22,29 @@ import torch
 import torch.nn.functional as F
 
 from perception.masks.boundaries import inputs_of, scaled
-from perception.masks.head import DIRECT, OFFSETS, OUTPUTS, PROJECTED, THING, backbone, enlarged, forward, shapes
+from perception.masks.head import (
+    DIRECT,
+    OFFSETS,
+    OUTPUTS,
+    PROJECTED,
+    THING,
+    WEIGHTS,
+    backbone,
+    enlarged,
+    forward,
+    shapes,
+)
+from training import crowds, masks
 from training.boundaries import CHANNELS
+from worlds import scene as scenes
 
 if TYPE_CHECKING:
     from perception.masks.boundaries import Layers
     from perception.masks.stereo import StereoView
 
+scenes.SCENES |= {"crowds": crowds}
+SCENES = (*masks.SCENES, ("crowds", 5000, 3), ("crowds", 5001, 3), ("crowds", 5002, 3))  # first seed, step
+VIEWS = 6  # of a reading; others in the two readings of a world
 STEPS, BATCH, RATE = 425, 6, 3e-3
 CYCLE, FALL = 600, 100  # steps: of the schedule of the rate, and the last ones, in which it falls to 0
 CROP, GRID = (160, 224), 32  # of a photo, in pixels; its place, which the maps of all strides share
@@ -192,3 +218,30 @@ def _folded(layers: Layers, means: tuple[torch.Tensor, ...], scales: tuple[torch
         weight = weight / scale
         layers[k] = weight, offset - (weight * mean).sum(dim=(1, 2, 3))
     return layers
+
+
+def photos_in(folder: Path, stereo: bool) -> Photos:
+    """What is learned from one reading of a world."""
+    reading = masks.make_reading(folder, stereo)
+    some = np.random.default_rng(1).permutation(len(reading.views))[VIEWS * stereo :][:VIEWS].tolist()
+    views, ids = ([column[k] for k in some] for column in (reading.views, reading.ids))
+    return photos_of(views, ids, reading.stuff, seed=int(stereo))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("work", type=Path, metavar="WORK", help="folder of the worlds")
+    parser.add_argument("--worlds", type=int, default=1, metavar="N", help="sets of nine to train on (default 1)")
+    parser.add_argument("-o", "--output", type=Path, default=WEIGHTS, metavar="FILE", help="default: the package")
+    options = parser.parse_args(arguments)
+    options.work.mkdir(parents=True, exist_ok=True)
+    numbers = [k for k in range(2 * options.worlds) if k % 10 < 8][: options.worlds]
+    jobs = masks.jobs_of(options.work, numbers, SCENES)
+    with ProcessPoolExecutor(os.cpu_count(), initializer=masks._one_thread) as pool:
+        photos = Photos.joined(list(pool.map(photos_in, *zip(*jobs, strict=True))))
+    layers = train(photos, 0, options.work / "head_state.pt")
+    np.savez_compressed(options.output, *(part.numpy().astype(np.float16) for layer in layers for part in layer))
+
+
+if __name__ == "__main__":
+    main()

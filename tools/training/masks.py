@@ -27,14 +27,13 @@ from typing import Any
 import numpy as np
 
 from perception.bench.output import Column, table
-from perception.masks.boundaries import WEIGHTS as SMALL
+from perception.masks.boundaries import WEIGHTS as BORDERS
 from perception.masks.boundaries import inputs_of
-from perception.masks.builtin import MERGING
-from perception.masks.head import WEIGHTS as HEAD
 from perception.masks.merge_features import PAIR_FEATURES, pair_features
 from perception.masks.merging import (
     REGION_COLUMNS,
     SMALLEST,
+    WEIGHTS,
     MergeModel,
     MergeTree,
     Network,
@@ -47,16 +46,15 @@ from perception.masks.stereo import StereoView
 from perception.masks.surface import FOOTPRINTS
 from perception.masks.surface_graph import SurfaceGraph
 from support.mask_scores import leaf_sums
-from training import boundaries, clutter, crowds, heads, patchwork
+from training import boundaries, clutter, patchwork
 from worlds import scene as scenes
 
-scenes.SCENES |= {"clutter": clutter, "crowds": crowds, "patchwork": patchwork}
+scenes.SCENES |= {"clutter": clutter, "patchwork": patchwork}
 PATCHWORK = (("patchwork", 4000, 2), ("patchwork", 4001, 2))  # first seed, step
-CROWDS = (("crowds", 5000, 3), ("crowds", 5001, 3), ("crowds", 5002, 3))
-SCENES = (("clutter", 3100, 2), ("clutter", 3101, 2), ("room", 2000, 1), ("tabletop", 1000, 1), *PATCHWORK, *CROWDS)
+SCENES = (("clutter", 3100, 2), ("clutter", 3101, 2), ("room", 2000, 1), ("tabletop", 1000, 1), *PATCHWORK)
 KEPT = {"validation": (8, 18), "test": (9, 19)}  # numbers of sets that are not trained on
 PAIRS, LEAST = 8000, 20  # pairs of one world and round; voxels of a region that is learned from
-VIEWS = 9  # of a reading that borders are learned from; 6 for the head, others in each reading
+VIEWS = 9  # of a reading that borders are learned from
 MEMBERS = 3  # networks of an ensemble for pairs; twice as many for regions, of which there are fewer
 COSTS = (0.01, 0.02, 0.05, 0.1, 0.15)  # higher ones join things in scenes unlike the worlds
 NOISE, NEARER = 0.1, 0.3  # standard deviations: of inputs, relative to theirs; of the logarithm of the size of things
@@ -136,7 +134,7 @@ def read_scene(folder: Path, stereo: bool, seed: int = 0, skip: int = -1, side: 
     return Reading(views, ids, side or drawn, [entry["id"] for entry in named if entry["is_stuff"]], walls)
 
 
-def world_of(reading: Reading, borders: Path = HEAD) -> World:
+def world_of(reading: Reading, borders: Path = BORDERS) -> World:
     """The surface graph of a reading, with the truth. The tabletop's three walls count as three. borders: weights."""
     from perception.masks.builtin import fuse, surface_graph
 
@@ -197,15 +195,7 @@ def border_samples(folder: Path, stereo: bool) -> tuple[np.ndarray, np.ndarray]:
     return np.stack(inputs), np.stack([boundaries.targets_of(reading.ids[k], reading.stuff) for k in some])
 
 
-def head_photos(folder: Path, stereo: bool) -> heads.Photos:
-    """What the head learns from: some views, others in the two readings."""
-    reading, count = make_reading(folder, stereo), 2 * VIEWS // 3
-    some = np.random.default_rng(1).permutation(len(reading.views))[count * stereo :][:count].tolist()
-    chosen = ([column[k] for k in some] for column in (reading.views, reading.ids))
-    return heads.photos_of(*chosen, reading.stuff, seed=int(stereo))
-
-
-def make_world(folder: Path, stereo: bool, borders: Path = HEAD) -> World:
+def make_world(folder: Path, stereo: bool, borders: Path = BORDERS) -> World:
     """The surface graph of the scene SCENE_SEED, with the truth."""
     return world_of(make_reading(folder, stereo), borders)
 
@@ -251,11 +241,10 @@ def regions_of(world: World, pair: Network) -> Samples:
 
 def fit(
     samples: list[Samples], size: np.ndarray, epochs: int, seed: int, members: int = MEMBERS,
-    hidden: tuple[int, int] = (24, 12), start: Network | None = None,
+    hidden: tuple[int, int] = (24, 12),
 ) -> Network:  # fmt: skip
     """Networks with two layers of `hidden` units, by AdamW on the weighted cross entropy. size: [F] power of the
-    size of things in each feature. Inputs are varied by other sizes and by noise, for stability. start: what learning
-    goes on from, at a lower rate."""
+    size of things in each feature. Inputs are varied by other sizes and by noise, for stability."""
     import torch
 
     torch.manual_seed(seed)
@@ -263,19 +252,14 @@ def fit(
     torch.set_num_threads(1)  # sums of one order
     x, y, weight = (np.concatenate(column) for column in zip(*samples, strict=True))
     mean, scale = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-3)
-    if start is not None:
-        unused = (start.parts[2] == 0).all(axis=(0, 1))  # inputs that it was not given
-        mean, scale = (np.where(unused, own, old) for own, old in zip((mean, scale), start.parts, strict=False))
     inputs = torch.from_numpy(np.clip((x - mean) / scale, -5, 5).astype(np.float32))
     target, weights = (torch.from_numpy(a.astype(np.float32)) for a in (y, weight[:, None] / weight.mean()))
     nearer = torch.tensor([NEARER * power / float(scale[k]) for k, power in enumerate(size.tolist())])
     sizes = [x.shape[1], *hidden, y.shape[1]]
     layers = [(torch.randn(members, b, a) * (2 / a) ** 0.5).requires_grad_() for a, b in pairwise(sizes)]
     offsets = [torch.zeros(members, 1, b, requires_grad=True) for b in sizes[1:]]
-    if start is not None:
-        layers, offsets = ([torch.from_numpy(p.copy()).requires_grad_() for p in start.parts[k::2]] for k in (2, 3))
     steps = epochs * len(x) // 1024
-    optimiser = torch.optim.AdamW([*layers, *offsets], lr=4e-3 if start is None else 1e-3, weight_decay=1e-3)
+    optimiser = torch.optim.AdamW([*layers, *offsets], lr=4e-3, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     for _ in range(steps):
         some = torch.randint(len(x), (members, 1024))
@@ -291,27 +275,16 @@ def fit(
     return Network((mean.astype(np.float32), scale.astype(np.float32), *learned))
 
 
-def learn(
-    worlds: list[World],
-    seed: int = 0,
-    each: Callable[..., Iterable[Samples]] = map,
-    start: MergeModel | None = None,
-) -> MergeModel:
-    """Both networks, with a cost and a calibration yet to be tuned. each: `map`, or that of a pool. start: networks
-    that learning goes on from."""
-    samples: list[Samples] = []
+def learn(worlds: list[World], seed: int = 0, each: Callable[..., Iterable[Samples]] = map) -> MergeModel:
+    """Both networks, with a cost and a calibration yet to be tuned. each: `map`, or that of a pool."""
+    samples = list(each(pairs_of, worlds, repeat(plain_rule), repeat(seed)))
     size = np.array([PAIR_SIZE.get(name, 0) for name in PAIR_FEATURES])
-    if start is None:
-        samples += each(pairs_of, worlds, repeat(plain_rule), repeat(seed))
-        first, old, region_epochs = fit(samples, size, 6, seed), None, 20
-    else:
-        first, old, region_epochs = start.pair, start, 10
-    samples += each(pairs_of, worlds, repeat(first), repeat(seed + 1))
-    pair = fit(samples, size, 6, seed, start=old and old.pair)
+    first = fit(samples, size, 6, seed)
+    pair = fit(samples + list(each(pairs_of, worlds, repeat(first), repeat(seed + 1))), size, 6, seed)
     regions = list(each(regions_of, worlds, repeat(pair)))
     size = np.zeros(regions[0][0].shape[1], int)
     size[: len(REGION_COLUMNS)] = [REGION_SIZE.get(name, 0) for name in REGION_COLUMNS]  # the rest are differences
-    region = fit(regions, size, region_epochs, seed, 2 * MEMBERS, (32, 16), old and old.region)
+    region = fit(regions, size, 20, seed, 2 * MEMBERS, (32, 16))
     return MergeModel(pair, region, COSTS[0])
 
 
@@ -379,26 +352,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--spread", type=int, default=1, metavar="N", help="read them N times, one photo less each time"
     )
     parser.add_argument("--weights", type=Path, metavar="DIR", help="test the weights of DIR and learn nothing")
-    parser.add_argument(
-        "--start", type=Path, metavar="FILE", help="networks that merge: go on from them, with their cost, calibration"
-    )
-    parser.add_argument(
-        "--without-backbone", action="store_true", help="the networks that are used where the extra is not installed"
-    )
-    parser.add_argument("-o", "--output", type=Path, default=HEAD.parent, metavar="DIR", help="default: the package")
+    parser.add_argument("-o", "--output", type=Path, default=WEIGHTS.parent, metavar="DIR", help="default: the package")
     options = parser.parse_args(arguments)
     options.work.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(os.cpu_count(), initializer=_one_thread) as pool:
-        kind = SMALL if options.without_backbone else HEAD
         if options.weights is None:
-            train(options.work, options.worlds, options.output, kind, options.start, pool)
+            train(options.work, options.worlds, options.output, pool)
         weights = options.weights or options.output
-        model, borders = read_model(weights / MERGING[kind].name), weights / kind.name
+        model, borders = read_model(weights / WEIGHTS.name), weights / BORDERS.name
         groups: dict[str, list[World]] = {}
         jobs = jobs_of(options.work, KEPT["test"])
         for (folder, stereo), world in zip(jobs, made_worlds(jobs, borders, pool), strict=True):
-            name = folder.name.split("_")[0] if folder.name.startswith(("patchwork", "crowds")) else "test"
-            groups.setdefault(f"{name}, {'stereo' if stereo else 'sensor'}", []).append(world)
+            kind = "patchwork" if folder.name.startswith("patchwork") else "test"
+            groups.setdefault(f"{kind}, {'stereo' if stereo else 'sensor'}", []).append(world)
         groups["all of them"] = list(chain(*groups.values()))
         for scene, stereo in product(options.scenes, (False, True)):
             name = f"{scene.name}, {'stereo' if stereo else 'sensor'}"
@@ -410,37 +376,26 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(report(model, groups))
 
 
-def train(work: Path, sets: int, output: Path, kind: Path, start: Path | None, pool: ProcessPoolExecutor) -> None:
-    """Makes the weights from that many sets, and tunes them on those of validation. kind: SMALL or HEAD. start: of
-    networks that merge, which learning goes on from; their cost and calibration stay."""
+def train(work: Path, sets: int, output: Path, pool: ProcessPoolExecutor) -> None:
+    """Makes the weights from that many sets, and tunes them on those of validation."""
     numbers = [k for k in range(2 * sets) if k % 10 < 8][:sets]
-    jobs, borders = jobs_of(work, numbers), work / kind.name
+    jobs, borders = jobs_of(work, numbers), work / BORDERS.name
     if not borders.is_file():
-        if kind == SMALL:
-            inputs, targets = zip(*pool.map(border_samples, *zip(*jobs, strict=True)), strict=True)
-            layers = boundaries.train(np.concatenate(inputs), np.concatenate(targets), seed=0)
-        else:
-            photos = heads.Photos.joined(list(pool.map(head_photos, *zip(*jobs, strict=True))))
-            layers = heads.train(photos, 0, work / "head_state.pt")
-        aside = work / f"part_{kind.name}"
+        inputs, targets = zip(*pool.map(border_samples, *zip(*jobs, strict=True)), strict=True)
+        layers = boundaries.train(np.concatenate(inputs), np.concatenate(targets), seed=0)
+        aside = work / f"part_{BORDERS.name}"
         np.savez_compressed(aside, *(part.numpy().astype(np.float16) for layer in layers for part in layer))
         aside.replace(borders)
-    worlds, old = made_worlds(jobs, borders, pool), start and read_model(start)
-    model = learn(worlds, each=pool.map, start=old)
-    if old is None:
-        model = tuned(model, made_worlds(jobs_of(work, KEPT["validation"]), borders, pool))
-    else:
-        model = replace(model, cost=old.cost, calibration=old.calibration)
+    worlds, kept = (made_worlds(some, borders, pool) for some in (jobs, jobs_of(work, KEPT["validation"])))
+    model = tuned(learn(worlds, each=pool.map), kept)
     settings = np.array([model.cost, *model.calibration])
-    np.savez_compressed(output / MERGING[kind].name, settings, *model.pair.parts, *model.region.parts)
-    shutil.copyfile(borders, output / kind.name)
+    np.savez_compressed(output / WEIGHTS.name, settings, *model.pair.parts, *model.region.parts)
+    shutil.copyfile(borders, output / BORDERS.name)
 
 
-def jobs_of(work: Path, sets: Iterable[int]) -> list[tuple[Path, bool]]:
+def jobs_of(work: Path, sets: Iterable[int], kept: Sequence[tuple[str, int, int]] = SCENES) -> list[tuple[Path, bool]]:
     """Folder of each world of the sets, read as by a sensor and by stereo."""
-    kinds = [
-        (f"{scene}_{first + step * k}", stereo) for k in sets for scene, first, step in SCENES for stereo in (0, 1)
-    ]
+    kinds = [(f"{scene}_{first + step * k}", stereo) for k in sets for scene, first, step in kept for stereo in (0, 1)]
     return [(work / name, bool(stereo)) for name, stereo in kinds]
 
 
