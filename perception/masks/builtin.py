@@ -15,8 +15,8 @@ from perception.io.memory import Keep
 from perception.masks.base import LoadImage, MaskSource
 from perception.masks.boundaries import WEIGHTS, boundaries, read_layers
 from perception.masks.cues import filled
+from perception.masks.head import DIRECT, borders
 from perception.masks.head import WEIGHTS as HEAD
-from perception.masks.head import borders
 from perception.masks.merging import Segmentation, segmentation
 from perception.masks.outlines import follow_borders
 from perception.masks.stereo import StereoView, make_stereo_view, measure_depths
@@ -25,7 +25,7 @@ from perception.masks.surface_graph import SurfaceGraph, patches, voxel_edges
 from perception.progress import QUIET, Progress
 from perception.types import View
 
-VERSION = 15  # increased whenever the label images change, so that cached ones are recomputed
+VERSION = 14  # increased whenever the label images change, so that cached ones are recomputed
 _SMOOTH = 0.03  # relative to the depth: a pixel with a larger depth step is not part of the surface
 _LEAST_VOXELS = 100
 
@@ -35,7 +35,8 @@ class BuiltinSegmentation(MaskSource):
 
     needs_depth = True
 
-    def __init__(self) -> None:
+    def __init__(self, follow: bool = False) -> None:
+        """follow: whether labels follow the borders of `head`. InputError if its backbone is not installed."""
         import cv2
 
         if not hasattr(cv2, "ximgproc"):
@@ -43,19 +44,13 @@ class BuiltinSegmentation(MaskSource):
                 f"--masks builtin: OpenCV {cv2.__version__} has no ximgproc, so another OpenCV package hides "
                 "opencv-contrib-python-headless; uninstall the other and install that one again"
             )
-        self.name, self._follows, self._told = "builtin", True, list[str]()
-        try:
+        if follow:
             packaged_file(*CLASSIFIER)
-        except InputError as missing:
-            self._follows = False
-            self._told = [f"masks from builtin: labels do not follow the borders that a backbone sees: {missing}"]
-        self.identity = f"builtin {VERSION}" + (" with backbone" if self._follows else "")
-        self._views: dict[str, StereoView] = {}
+        self.name, self._follow = "builtin", follow
+        self.identity = f"builtin {VERSION}" + (" borders" if follow else "")
+        self._voxels: dict[str, np.ndarray] = {}  # of each photo, [h, w] the voxel that each pixel shows, −1 = none
+        self._direct: dict[str, np.ndarray] = {}  # of each photo, [2, h, w] float16 log odds, see `head.DIRECT`
         self._segment = np.zeros(0, np.int32)
-
-    def check(self, views: list[View]) -> list[str]:
-        """Says if the backbone of `head` is not installed."""
-        return self._told
 
     def prepare(
         self,
@@ -75,22 +70,25 @@ class BuiltinSegmentation(MaskSource):
         if len(surface) < _LEAST_VOXELS:
             return None
         cuts = segmentation(surface_graph(stereo, surface))
-        self._segment, self._views = cuts.segment, {view.name: view for view in stereo}
+        self._segment, self._voxels = cuts.segment, {view.name: view.voxel for view in stereo}
+        for view in stereo if self._follow else []:
+            found = borders(view.photo, *view.cues(), read_layers(HEAD))
+            self._direct[view.name] = keep(found[DIRECT].astype(np.float16))
         return cuts
 
     def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
         """[H, W] int32 labels of `photo` [H, W, 3], after `prepare`. All 0 if the photo does not show the surface."""
         import cv2
 
-        if view.name not in self._views:
+        if view.name not in self._voxels:
             return np.zeros(photo.shape[:2], np.int32)
-        seen = self._views[view.name]
-        labels = np.where(seen.voxel >= 0, self._segment[seen.voxel], 0)
+        voxel = self._voxels[view.name]
+        labels = np.where(voxel >= 0, self._segment[voxel], 0)
         known = labels > 0
         if known.any():  # pixels off the surface take the nearest segment in the image
             labels = filled(labels, known)
-        if known.any() and self._follows:  # or the one that they reach without crossing a border
-            labels = follow_borders(labels, known, borders(seen.photo, *seen.cues(), read_layers(HEAD)))
+        if known.any() and self._follow:  # or the one that they reach without crossing a border
+            labels = follow_borders(labels, known, self._direct[view.name])
         return cv2.resize(labels, photo.shape[1::-1], interpolation=cv2.INTER_NEAREST)
 
 

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from perception.masks.head import DIRECT
-
 BAND = 1.0  # pixels to either side of an outline within which it is moved
 _STEP = 0.001  # cost of one pixel, beside the probability of a border: without borders the nearest label wins
 _CORE = 0.5  # share of the half width of a narrow region that keeps its label
 
 
-def follow_borders(labels: np.ndarray, known: np.ndarray, learned: np.ndarray) -> np.ndarray:
-    """labels: [h, w] int; known: [h, w] bool, pixels whose label is more than that of the nearest one; learned:
-    [11, h, w] log odds, see `head.borders`. Pixels near outlines, and those not known, take the label to which the
-    cheapest path leads; a path costs the probabilities of the borders that it crosses. Every connected region of known
-    pixels keeps its core, so none is lost."""
+def follow_borders(labels: np.ndarray, known: np.ndarray, direct: np.ndarray) -> np.ndarray:
+    """labels: [h, w] int; known: [h, w] bool, pixels whose label is more than that of the nearest one; direct:
+    [2, h, w] log odds of a border between a pixel and its right neighbour, its lower one. Pixels near outlines, and
+    those not known, take the label to which the cheapest path leads; a path costs the probabilities of the borders that
+    it crosses. Every connected region of known pixels keeps its core, so none is lost."""
     from scipy.ndimage import maximum
     from scipy.sparse.csgraph import connected_components, dijkstra
 
@@ -23,7 +21,7 @@ def follow_borders(labels: np.ndarray, known: np.ndarray, learned: np.ndarray) -
     flat = labels.ravel()
     before = np.concatenate([index[:, :-1].ravel(), index[:-1].ravel()])
     after = np.concatenate([index[:, 1:].ravel(), index[1:].ravel()])
-    odds = np.concatenate([learned[DIRECT.start, :, :-1].ravel(), learned[DIRECT.start + 1, :-1].ravel()])
+    odds = np.concatenate([direct[0, :, :-1].ravel(), direct[1, :-1].ravel()])
     sure = known.ravel()
     cut = (flat[before] != flat[after]) | (sure[before] != sure[after])
     if not sure.any() or (sure.all() and not cut.any()):

