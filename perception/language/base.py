@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
 from perception import _core
-from perception.errors import InputError, missing_extra
+from perception.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -117,18 +115,3 @@ def unit_rows(x: np.ndarray) -> np.ndarray:
         return np.concatenate([unit_rows(x[at : at + AT_ONCE]) for at in range(0, len(x), AT_ONCE)])
     norms = np.linalg.norm(x.astype(np.float64), axis=-1, keepdims=True)
     return (x / np.where(norms > 0, norms, 1.0)).astype(np.float32)
-
-
-def packaged_file(package: str, pattern: str) -> Path:
-    """Path of a weight file that an installed package contains. The package is not imported.
-
-    pattern: for Path.glob, relative to the package's folder. Raises InputError if the package or the file is missing.
-    """
-    spec = importlib.util.find_spec(package)
-    if spec is None or spec.origin is None:
-        raise missing_extra(package.replace("_", "-"), "demo")
-    folder = Path(spec.origin).parent
-    files = sorted(folder.glob(pattern))
-    if not files:
-        raise InputError(f"{folder}: holds no {pattern}; reinstall {package.replace('_', '-')}")
-    return files[0]

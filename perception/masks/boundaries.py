@@ -86,9 +86,9 @@ def forward(layers: Layers, inputs: torch.Tensor) -> torch.Tensor:
 
 @functools.cache
 def read_layers(file: Path = WEIGHTS) -> Layers:
-    """The layers of the package, or of another file of `tools/training/masks.py`."""
+    """The layers of the package, or of another file of `tools/training`; also those of `head`."""
     import torch
 
     with np.load(file) as stored:
-        parts = [torch.from_numpy(stored[f"arr_{k}"].astype(np.float32)) for k in range(2 * len(shapes()))]
+        parts = [torch.from_numpy(stored[f"arr_{k}"].astype(np.float32)) for k in range(len(stored.files))]
     return list(zip(parts[::2], parts[1::2], strict=True))

