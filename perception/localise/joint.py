@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from perception.localise.keypoints import Described, triangulated
-from perception.localise.reference import LOOSE, Reference
+from perception.localise.reference import Reference
 from perception.sfm.bundle_adjustment import Poses, adjust, residuals
 from perception.sfm.consistency import Pair, stronger_contradictions
 from perception.sfm.pose_refinement import match_errors
@@ -15,6 +15,9 @@ from perception.sfm.tracks import Features, grouped, observed
 
 ROUNDS = 2
 """Rounds of tracks and adjustment: with better poses, more features agree."""
+LOOSE = 0.1
+"""Standard error of the start of a new pose: angle in radians, position as a share of the distance to the points. It
+keeps the equations regular and weighs nothing beside features."""
 
 
 @dataclass(frozen=True)

@@ -58,9 +58,8 @@ class NewPhoto:
 @dataclass(frozen=True)
 class Localised:
     """A photo's pose: camera_from_map [4, 4] float64, OpenCV axes, in the map's frame and unit. lens: known, or as
-    estimated. covariance [6, 6]: of the rotation vector about the map's axes (radians), then of the position, wider
-    where the map's cameras disagree with its photos. inliers: features that agree with the pose; rms_px: their error in
-    pixels."""
+    estimated. covariance [6, 6]: of the rotation vector about the map's axes (radians), then of the position. inliers:
+    features that agree with the pose; rms_px: their error in pixels."""
 
     name: str
     photo: Path
@@ -269,7 +268,7 @@ class _Search:
         if number not in self.placed or found is None:
             return NotHere(photo.name, photo.photo, f"not in this map: {self.why[number]}")
         lens, pose = view_lens(self.views[number]), self.placed[number]
-        figures = self.reference.own_error**2 * found.covariance[number], found.inliers[number], found.rms[number]
+        figures = found.covariance[number], found.inliers[number], found.rms[number]
         return Localised(photo.name, photo.photo, lens, pose, *figures)
 
 

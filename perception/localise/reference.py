@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -17,18 +16,13 @@ from perception.map.map import MAX_SIDE, Map
 from perception.photos.decode import scaled_K, scaled_size, why_left_out
 from perception.photos.views import view_lens
 from perception.progress import Progress
-from perception.sfm.bundle_adjustment import Poses, adjust
+from perception.sfm.bundle_adjustment import Poses
 from perception.sfm.database import build_features
 from perception.sfm.options import ReadOptions
 from perception.sfm.pose_refinement import agreeing, poses_of
-from perception.sfm.tracks import features_of, grouped, observed
+from perception.sfm.tracks import features_of, grouped
 from perception.types import View
 
-REFINED, LEAST_FEATURES = 10, 20
-"""Cameras of the map by which its own error is measured, and least features of one."""
-LOOSE = 0.1
-"""Standard error of the start of a new pose: angle in radians, position as a share of the distance to the points. It
-keeps the equations regular and weighs nothing beside features."""
 Locate = Callable[[View], View]
 """The view with the path of its photo; InputError when it is not at hand."""
 
@@ -45,28 +39,6 @@ class Reference:
     poses: Poses
     point: np.ndarray
     points: np.ndarray
-
-    @cached_property
-    def own_error(self) -> float:
-        """Errors of a pose over its standard errors, at least 1, by the map's own cameras: some are refined, with the
-        others held as for new photos, and compared with where the map has them, in the root mean square."""
-        count = len(self.views)
-        free = np.zeros(count, bool)
-        free[np.linspace(0, count - 1, min(REFINED, count // 2)).astype(np.int64)] = True
-        rows = np.flatnonzero(self.point >= 0)
-        rows = rows[np.argsort(self.point[rows], kind="stable")]
-        view = self.described.features.view
-        seen = np.bincount(self.point[rows], free[view[rows]], len(self.points)) > 0
-        rows = rows[seen[self.point[rows]]]
-        free &= np.bincount(view[rows], minlength=count) >= LEAST_FEATURES
-        if not free.any():
-            return 1.0
-        tracks = observed(self.described.features, rows, (np.cumsum(seen) - 1)[self.point[rows]])
-        distance = float(np.median(np.linalg.norm(self.points[seen] - self.poses.center[free].mean(axis=0), axis=1)))
-        found = adjust(tracks, self.poses, self.poses, (LOOSE, LOOSE * distance), held=~free)
-        change = found.poses.since(self.poses)[free]
-        squares = np.einsum("ni,nij,nj->n", change, np.linalg.inv(found.covariances()), change) / change.shape[1]
-        return max(1.0, float(np.sqrt(squares.mean())))
 
 
 def open_reference(gmap: Map, locate: Locate, progress: Progress) -> Reference:
