@@ -42,7 +42,10 @@ class MiniLM:
         self._tokenizer.no_padding()
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
-        """Texts → float32 [n, 384], unit rows. Batches contain texts of equal length, so nothing is padded."""
+        """Texts → float32 [n, 384], unit rows. Batches contain texts of equal length, so nothing is padded. BLAS uses one
+        thread meanwhile: its last bits depend on their number."""
+        from threadpoolctl import threadpool_limits
+
         tidy = check_texts(texts)
         once = list(dict.fromkeys(tidy))  # each distinct text is encoded once
         tokens = [encoding.ids for encoding in self._tokenizer.encode_batch(once)]
@@ -50,7 +53,8 @@ class MiniLM:
         for _, group in groupby(sorted(range(len(tokens)), key=lambda n: len(tokens[n])), lambda n: len(tokens[n])):
             same = list(group)
             for batch in (same[start : start + BATCH] for start in range(0, len(same), BATCH)):
-                out[batch] = self._forward(np.array([tokens[n] for n in batch]))
+                with threadpool_limits(1, "blas"):
+                    out[batch] = self._forward(np.array([tokens[n] for n in batch]))
         row_of = {text: n for n, text in enumerate(once)}
         return unit_rows(out)[[row_of[text] for text in tidy]]
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 os.environ["HF_HUB_OFFLINE"] = "1"
 torch = pytest.importorskip("torch")
@@ -61,6 +62,14 @@ def test_sentences_equal_transformers() -> None:
     weight = tokens["attention_mask"][..., None].float()
     expected = torch.nn.functional.normalize((hidden * weight).sum(1) / weight.sum(1), dim=-1).numpy()
     assert np.abs(MiniLM().encode(TEXTS) - expected).max() < 1e-5
+
+
+def test_sentences_have_the_same_bits_for_any_number_of_threads() -> None:
+    sentences, texts = MiniLM(), [f"{color} {thing}" for color in ("red", "old") for thing in ("mug", "book", "wall")]
+    with threadpool_limits(1, "blas"):
+        expected = sentences.encode(texts)
+    with threadpool_limits(2, "blas"):
+        assert np.array_equal(sentences.encode(texts), expected)
 
 
 def test_damaged_weights_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
