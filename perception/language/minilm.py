@@ -42,8 +42,10 @@ class MiniLM:
         self._tokenizer.no_padding()
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
-        """Texts → float32 [n, 384], unit rows. Batches contain texts of equal length, so nothing is padded. BLAS uses one
-        thread meanwhile: its last bits depend on their number."""
+        """Texts → float32 [n, 384], unit rows. Batches contain texts of equal length, so nothing is padded.
+
+        BLAS uses one thread meanwhile: the last bits depend on their number.
+        """
         from threadpoolctl import threadpool_limits
 
         tidy = check_texts(texts)
