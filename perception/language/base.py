@@ -34,7 +34,8 @@ class Reading:
     phrases that a prompt must exceed (LERF); empty for encoders whose sentence embeddings do not describe images.
     zooms: best number of crops per view (3 in the paper). colors: it knows colours, so that colour words stay in the
     prompt. scale: factor of a cosine in the model's log odds (CLIP's and SigLIP's logit_scale). even: cosine at which a
-    text and a picture are as likely to belong together as not; None: not known.
+    text and a picture are as likely to belong together as not; None: not known. wholes: it knows whole
+    objects, so that no part of an instance answers: half a book may look like a laptop to it.
     """
 
     parts: tuple[Part, ...] = ()
@@ -44,6 +45,7 @@ class Reading:
     colors: bool = False
     scale: float = 10.0
     even: float | None = None
+    wholes: bool = False
 
 
 def reading_of(encoder: Encoder) -> Reading:

@@ -113,7 +113,7 @@ class ConseEncoder:
     def reading(self) -> Reading:
         """The two spaces and their weights. How specific a text is, is measured in sentence space only."""
         parts = (Part(MiniLM.dim, 1 - SHARE, self._centred), Part(self.dim, SHARE))
-        return Reading(parts, CALIBRATION, zooms=2)  # it names the dominant object, so wide crops mislead it
+        return Reading(parts, CALIBRATION, zooms=2, wholes=True)  # it names the dominant object: no wide crops
 
     @cached_property
     def _centred(self) -> np.ndarray:

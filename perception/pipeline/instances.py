@@ -32,8 +32,7 @@ from perception.progress import Progress
 HALVED_FROM = 480
 """Long side in pixels from which silhouettes are rendered at half the resolution, at a third of the time."""
 NODE_VIEWS = 3
-"""Views of each part and group that are embedded. By one crop of each, some of the many look like what is not there: a
-corner of a book like a laptop. Of 56 absent things 8 were answered in the demo's map, and 4 by three views."""
+"""Views of each part and group that are embedded. By one crop of each, some of the many look like what is not there."""
 
 
 @dataclass
@@ -103,7 +102,9 @@ def describe(
         described.language = embedded(grouped.ids, seen, language.views, language.zooms)
     nodes = min(NODE_VIEWS, language.views)
     if grouped.parents:
-        described.parts = {"ids": grouped.part_ids, **prefixed(embedded(part, parts_seen, nodes, language.zooms))}
+        wholes = encoder is not None and reading_of(encoder).wholes  # `upgrade` reads the views alone
+        arrays = embedded(part, parts_seen, 1, 1) if wholes else embedded(part, parts_seen, nodes, language.zooms)
+        described.parts = {"ids": grouped.part_ids, **prefixed(arrays)}
     if len(grouped.group_scores):
         arrays = prefixed(embedded(levels[2], groups_seen, nodes, language.zooms))
         described.groups = {"of": group_of[:-1], "scores": grouped.group_scores, **arrays}

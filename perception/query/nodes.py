@@ -76,14 +76,18 @@ class Nodes:
 
     def fitting(self, text: str, hits: list[tuple[int, float]]) -> list[Candidate]:
         """`hits` of all instances, best first, with the nodes that fit clearly better instead of the instances that
-        they share points with. Labels of the user and texts on shapes, relations and prints are left alone."""
+        they share points with; parts only if the encoder knows more than whole objects. Labels of the user and texts on
+        shapes, relations and prints are left alone."""
         special = shape_kind(text) or parse(text) or quoted_text(text)
         if not self._nodes or special or hits[0][1] == 1.0:
             return list(hits)
         score, count = dict(self._ranker.rank(text).hits), len(hits)
         z = {n: float(evidence_of(np.array(s))) for n, s in score.items()}
         chosen, replaced = list[Candidate](), set[int]()
+        wholes = self._ranker.encoder.reading.wholes
         for n, node in enumerate(self._nodes, start=count):
+            if node.is_part and wholes:
+                continue
             if score[n] >= PRESENT and z[n] >= CLEAR + max(z[i] for i in node.rows):
                 chosen.append((node, score[n]))
                 replaced.update(node.rows)

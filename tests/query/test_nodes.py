@@ -10,6 +10,7 @@ import pytest
 from perception.errors import InputError
 from perception.export.export_map import ExportOptions, at_granularity, export_map
 from perception.io.cloud import read_cloud
+from perception.language.base import Reading
 from perception.language.colors import PALETTE
 from perception.language.description import InstanceDescription, to_arrays
 from perception.map.write import read_map, write_map
@@ -56,6 +57,15 @@ def test_a_prompt_is_answered_by_the_node_that_it_names(gmap: QueryMap) -> None:
     np.testing.assert_array_equal(np.sort(both.points, axis=0), np.sort(members, axis=0))
     assert "part" not in mug.to_json() and "instances" not in mug.to_json()
     assert {hit.instance_id for hit in gmap.query("handle", min_score=0.0)} == set(range(3, 12))  # instances alone
+
+
+def test_parts_do_not_answer_where_the_encoder_knows_whole_objects(path: Path) -> None:
+    class Wholes(HashEncoder):
+        reading = Reading(wholes=True)
+
+    gmap = load_map(path, lambda name: Wholes())
+    assert all(hit.part is None for hit in gmap.query("handle"))
+    assert gmap.query("breakfast", top_k=1)[0].instances == (5, 6)
 
 
 def test_granularity_of_an_export(path: Path, tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ def test_rasterizer_rows_are_consistent(small, tmp_path, capsys):
 def test_a_file_that_holds_no_splats_is_named(tmp_path):
     path = tmp_path / "no.npz"
     path.write_text("text")
-    with pytest.raises(InputError, match=r"no\.npz: not a splats file"):
+    with pytest.raises(InputError, match=r"no\.npz: cannot be read"):
         load_scene(path)
     with pytest.raises(InputError, match="0 rounds"):
         rasterizer.main(["--rounds", "0"])
