@@ -127,15 +127,16 @@ class _Mapping:
         wrong = outvoted_photos(pairs)
         if not wrong or len(wrong) > best.num_reg_images() / 4:
             return models, set()
+        name_of = {image: best.images[image].name for image in best.reg_image_ids()}
         take_out(best, wrong)
         others = [p for p in pairs if not p.agrees and p.i not in wrong and p.j not in wrong]
         again = self._map(self._database_without(others), self.store.effort.inliers, best)
         best = again[0] if again and again[0].num_reg_images() >= best.num_reg_images() else best
         still = outvoted_photos(verified_pairs(best, self.store.database))
-        still |= wrong - set(best.reg_image_ids())
-        names = {best.images[image].name for image in still}
-        take_out(best, still & set(best.reg_image_ids()))
-        return [best, *models[1:]], names
+        registered = set(best.reg_image_ids())
+        name_of |= {image: best.images[image].name for image in registered}
+        take_out(best, still & registered)
+        return [best, *models[1:]], {name_of[image] for image in still | (wrong - registered)}
 
     def _map(self, database: Path, min_inliers: int, start: Any | None = None) -> list[Any]:
         pycolmap = load_pycolmap()
