@@ -109,7 +109,7 @@ def after_step(state: TrainingState, progress: float, may_stop: bool) -> None:
         _densify_and_judge(state, progress)
     if state.iteration % (5 * every) == 0 and state.progress < 1.0:
         _add_to_curve(state, progress)
-    if progress < STOP <= state.progress and state.has_labels:
+    if progress < STOP <= state.progress and state.has_labels and not state.held:  # an update adds in its own way
         _place_in_masks(state)
     if due and may_stop:
         _stop_early(state)
@@ -176,8 +176,7 @@ def _place_in_masks(state: TrainingState) -> None:
         surplus = len(state.gaussians) + len(born) - max(state.config.train.budget, len(state.gaussians))
         if len(born):
             if surplus > 0:
-                order = torch.argsort(state.gaussians.opacity_logits[state.held :], stable=True)[surplus:] + state.held
-                state.keep(torch.cat([torch.arange(state.held).to(order), order.sort().values]))
+                state.keep(torch.argsort(state.gaussians.opacity_logits, stable=True)[surplus:].sort().values)
             state.append(born.to(state.device))
             state.reset_statistics()
             _note(state, f"masks: {len(born)} Gaussians added in masks that had too few")

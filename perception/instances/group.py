@@ -66,10 +66,12 @@ def group(
     *,
     margin: float = 1.0,
     seed: int = 0,
+    whole: bool = True,
 ) -> Grouping:
     """Instances of N Gaussians: means [N, 3], scales [N, 3], opacities [N], features [N, D] float32.
 
-    margin: γ of the loss, the squared distance that it keeps between features of different objects.
+    margin: γ of the loss, the squared distance that it keeps between features of different objects. whole: they are all
+    of the map's; else masks may be those of others, and what they show is no reason to keep a small group.
     """
     features = np.where(np.isfinite(features), features, 0) / np.sqrt(margin)
     if config.method == "hdbscan":
@@ -79,7 +81,7 @@ def group(
         ids, parts, parents = _by_consensus(means, opacities, features, votes, seed)
     if config.settle:
         ids = reassign(ids, means, opacities, votes, MIN_OPACITY)
-        ids = _without_small(ids, votes, config.min_cluster_size)
+        ids = _without_small(ids, votes, config.min_cluster_size, whole)
         ids = reassign(ids, means, opacities, votes, MIN_OPACITY)
     return_free_memory()
     return _scored(ids, parts, parents, votes)
@@ -135,9 +137,9 @@ def _parted_by_masks(
     return segment_of
 
 
-def _without_small(ids: np.ndarray, votes: MaskVotes, min_size: int) -> np.ndarray:
+def _without_small(ids: np.ndarray, votes: MaskVotes, min_size: int, whole: bool) -> np.ndarray:
     """Sets ids to −1 for two kinds of groups: below `min_size` and supported by fewer than two photos; supported by no
-    photo and smaller than LEAST_OF_MEDIAN of the median group. None is what two photos show (`_shown`)."""
+    photo and smaller than LEAST_OF_MEDIAN of the median group. If `whole`, none is what two photos show (`_shown`)."""
     count = int(ids.max(initial=-1)) + 1
     if count == 0:
         return ids
@@ -146,7 +148,8 @@ def _without_small(ids: np.ndarray, votes: MaskVotes, min_size: int) -> np.ndarr
     support = evidence(groups).support
     kept = (sizes >= min_size) | ((sizes >= LEAST) & (support >= 2))
     kept &= (support > 0) | (sizes >= LEAST_OF_MEDIAN * np.median(sizes[sizes > 0]))
-    kept |= (sizes >= LEAST) & (_shown(groups) >= 2)
+    if whole:
+        kept |= (sizes >= LEAST) & (_shown(groups) >= 2)
     return np.where((ids >= 0) & np.append(kept, False)[ids], ids, -1)
 
 

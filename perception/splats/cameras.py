@@ -30,7 +30,7 @@ from perception.splats.gravity import gravity_of
 
 FIVE = 5.0
 """Views that each voxel is to be seen by."""
-MOST_VIEWS = 120
+MOST_VIEWS = 160
 ENOUGH = 2e-4
 """Gain of the next view, as share of all there is to gain, at which no more are chosen."""
 PLACES, SIDE = 240, 48

@@ -111,5 +111,5 @@ def grouped(gaussians: Gaussians, votes: MaskVotes, rows: np.ndarray, config: Ma
     own = MaskVotes(votes.pixels[rows], votes.void[rows], votes.view, votes.area)
     tensors = (part.means, part.scales, part.opacities, part.features)
     means, scales, opacities, features = (tensor.numpy() for tensor in tensors)
-    losses = config.losses
-    return group(means, scales, opacities, features, own, config.instances, margin=losses.margin, seed=config.seed)
+    arrays, margin = (means, scales, opacities, features), config.losses.margin
+    return group(*arrays, own, config.instances, margin=margin, seed=config.seed, whole=False)

@@ -258,6 +258,6 @@ def test_a_ring_is_kept_that_two_photos_show_though_its_gaussians_fill_a_fifth_o
     shares[40:, 1::2] = 20 / 6
     view, area = np.repeat(np.arange(photos), 2), np.tile([10_000.0, 100.0], photos)
     votes = MaskVotes(sparse.csr_matrix(shares), sparse.csr_matrix((46, photos), dtype=np.float32), view, area)
-    kept = _without_small(ids, votes, 32)
+    kept = _without_small(ids, votes, 32, whole=True)
     assert (kept[:40] == 0).all()
     assert (kept[40:] == (1 if photos == 2 else -1)).all()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -42,10 +41,10 @@ def query_paths(folder: Path) -> dict[str, Callable[[str], object]]:
 
     def served(text: str) -> object:
         asked = parse(QueryBody, {"text": text}).requests()
-        return [request.answered(gmap, time.monotonic()).to_json() for request in asked]
+        return [request.answered(gmap).to_json() for request in asked]
 
     def node(text: str) -> object:
-        return [question.request.answered(gmap, time.monotonic()).to_json() for question in read_questions(text)]
+        return [question.request.answered(gmap).to_json() for question in read_questions(text)]
 
     def viewer(text: str) -> object:
         return session.ask(text), escaped(session.question)

@@ -38,7 +38,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     size = {"views": 24, "later_views": 14, "width": 200, "height": 150, "light_samples": 2, "seed": 3}
     make_visits(folder, visits=2, share=SHARE, **size)
     first = folder / "visit0"
-    settings = ["train.iterations=500", "language.encoder=none", "language.texts=off"]
+    settings = ["train.iterations=700", "language.encoder=none", "language.texts=off"]
     build_map(first, folder / "old.gsmap", load_config(None, [f"masks=labels:{first / 'labels'}", *settings]))
     return folder
 
