@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import sys
 from collections.abc import Sequence
 from itertools import chain
 from typing import Any
@@ -187,6 +188,14 @@ def test_normal_distribution_equals_scipy() -> None:
     evidence = ndtri(np.clip(best / (1 - LAPSE), 1e-9, 1 - 1e-9))
     expected = np.maximum(PRESENT, (1 - LAPSE) * ndtr(evidence - BESIDE))
     assert np.allclose(least_score(best), expected, rtol=1e-12)
+
+
+def test_the_normal_distribution_without_the_compiled_core(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a robot's Python that has the sources alone."""
+    z = np.linspace(-9, 9, 101)
+    expected = normal_cdf(z)
+    monkeypatch.setitem(sys.modules, "perception._core", None)
+    assert np.allclose(normal_cdf(z), expected, rtol=1e-13, atol=0)
 
 
 def test_palette_shares_and_means() -> None:
