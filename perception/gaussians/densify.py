@@ -45,6 +45,8 @@ NEAREST = 1 / 3
 FAR = 0.95
 """Quantile of their depths that is used: regions without points are mostly background, and what fills them too near
 hangs as a veil before other cameras. With 12 blocks and 0.75 a wall behind a tree was put at the tree's depth."""
+MOST_BLOCKS = 2000
+"""Covered blocks that are looked at, evenly over the picture: as many pairs with empty ones are held in memory."""
 HOLE_OPACITY = 0.5
 """Opacity of the Gaussians added."""
 
@@ -207,9 +209,10 @@ def _in_holes(
     from scipy.spatial import cKDTree
 
     known, empty = np.argwhere(covered), np.argwhere(holes)
+    known = known[:: max(1, -(-len(known) // MOST_BLOCKS))]
     count = int(np.ceil(NEAREST * len(known)))
     _, near = cKDTree(known).query(empty, k=count)
-    around = depths[covered][near.reshape(len(empty), count)]
+    around = depths[tuple(known.T)][near.reshape(len(empty), count)]
     depth = np.quantile(around, FAR, axis=1).astype(np.float32)
 
     height, width = view.photo.shape[:2]

@@ -28,7 +28,7 @@ OPACITY = 0.9  # of those placed; training has little time left to strengthen th
 
 @dataclass(frozen=True)
 class _Seen:
-    """A photo as the map shows it. labels [H, W] int64; depth [H, W], 0 = none; area [M] and own [M]: pixels and
+    """A photo as the map shows it. labels [H, W] int; depth [H, W], 0 = none; area [M] and own [M]: pixels and
     Gaussians of each mask, 0 for label 0."""
 
     view: TrainingView
@@ -82,7 +82,7 @@ def for_starved_masks(gaussians: Gaussians, views: list[TrainingView], seed: int
 
 def _seen(gaussians: Gaussians, view: TrainingView) -> _Seen:
     assert view.labels is not None  # checked by the caller
-    labels = view.labels.numpy().astype(np.int64)
+    labels = view.labels.numpy()
     depth = surface_depth(gaussians, replace(view, depth=None))
     area = np.bincount(labels.ravel())
     area[0] = 0

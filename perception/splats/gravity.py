@@ -43,8 +43,7 @@ def gravity_of(normals: np.ndarray, means: np.ndarray, open_rays: np.ndarray, ra
 
     A candidate u has the evidence O + LOWER A + U: O the share of open rays within CONE of u, less that around −u; A
     the share of the Gaussians between the walls that lie in the lower half of the heights, less one half; U is USUAL
-    for one of the directions that files have up. Nobody takes photos of the sky, nor many of a ceiling; and things
-    stand on floors.
+    for one of the directions that files have up. Photos seldom show the sky or a ceiling, and things stand on floors.
     """
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     convention = np.array([0.0, -1.0, 0.0])
