@@ -28,7 +28,9 @@ def compiler() -> str:
 
 
 @pytest.mark.parametrize(("dims", "sh_degree", "options"), [
-    (5, None, {}), (0, 0, {}), (13, 1, {"eps2d": 2.0}), (5, 2, {}), (5, 3, {"near_plane": 1.5}),
+    (13, 1, {"eps2d": 2.0}), (5, 2, {}), (5, 3, {"near_plane": 1.5}),
+    pytest.param(5, None, {}, marks=pytest.mark.slow),
+    pytest.param(0, 0, {}, marks=pytest.mark.slow),
     pytest.param(8, 2, {"variance": False}, marks=pytest.mark.slow),
     pytest.param(0, None, {"depth": False}, marks=pytest.mark.slow),
 ])  # fmt: skip

@@ -207,6 +207,7 @@ def test_labels_and_votes_of_a_photo_are_those_of_the_cpu(pretended, monkeypatch
     assert here.pixels.nnz > 20
 
 
+@pytest.mark.slow
 def test_a_full_memory_is_met_with_fewer_records_then_refused(pretended, monkeypatch):
     of, limits = trainer(pretended, "train.iterations=1000"), []
     backward = on_device.rasterize_backward

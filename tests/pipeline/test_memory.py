@@ -81,6 +81,7 @@ def test_a_full_disk_is_an_error_and_not_a_signal(tmp_path: Path, monkeypatch: p
         DiskArrays(tmp_path, limit=0).keep(np.zeros(9))
 
 
+@pytest.mark.slow
 def test_a_map_is_the_same_with_its_photos_on_disk(small_scene: Path, tmp_path: Path) -> None:
     words = [f"masks=labels:{small_scene / 'labels'}", "train.iterations=8", "train.budget=500"]
     words.append("language.encoder=none")

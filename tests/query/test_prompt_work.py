@@ -95,7 +95,7 @@ def check(ask: Callable[[str], object], middle: str, tail: str) -> None:
     steps(ask, made("x ", middle, tail, LONG), LONG / SHORT * 1.1 * least + FIXED)
 
 
-@pytest.mark.parametrize("middle", PIECES)
+@pytest.mark.parametrize("middle", [*PIECES[:8], *(pytest.param(p, marks=pytest.mark.slow) for p in PIECES[8:])])
 def test_what_reads_words_takes_steps_in_proportion_to_them(middle: str) -> None:
     for read in (quoted_text, parse, without_color_words, household_thing):
         for tail in (",", ' "', " that says "):

@@ -211,6 +211,7 @@ def test_a_map_deleted_or_spoilt_while_served_is_told_and_the_old_one_answers(pa
 ODD: tuple[Any, ...] = (None, 3, -1, 1e308, True, "MUG", [], ["MUG"], [[]], {}, {"id": 1}, [{"text": 5, "score": 1}])
 
 
+@pytest.mark.slow
 def test_no_value_in_instances_json_ends_the_watcher(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Whatever stands there: it is taken over, or told in health and in the log; the mended file is taken over."""
     gmap = read_map(path)

@@ -129,6 +129,7 @@ def middle(picture: np.ndarray) -> np.ndarray:
 # ---------------------------------------------------------------------- stdio
 
 
+@pytest.mark.slow
 def test_every_tool_over_stdio_and_a_map_replaced_under_it(tmp_path: Path, photo: Path) -> None:
     path = write_seen_map(tmp_path / "a.gsmap", photo)
     other = write_seen_map(tmp_path / "b.gsmap", photo, first_id=100)
