@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import subprocess
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -128,6 +129,8 @@ def test_a_client_recovers_from_a_node_killed_under_load(map_path: Path) -> None
     first = node(map_path, "mortal")
     client = started(SUPPORT / "rclpy_asker.py", "mortal", *LABELS)
     assert client.stdout is not None
+    watch = threading.Timer(2 * WAIT, client.kill)  # a client that gets no answer writes no line for good
+    watch.start()
     try:
         told = [client.stdout.readline() for _ in range(20)]
         first.kill()  # not asked: dead at once, in the middle of whatever it does
@@ -135,6 +138,7 @@ def test_a_client_recovers_from_a_node_killed_under_load(map_path: Path) -> None
         first = node(map_path, "mortal")
         told += [client.stdout.readline() for _ in range(20)]
     finally:
+        watch.cancel()
         for process in (client, first):
             process.kill()
             process.communicate()
