@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from perception.boxes import BOX_TRIM, oriented_box
 from perception.colors import rgb8_from_sh
 from perception.map.history import is_removed, last_seen, since
 from perception.map.map import InstanceIndex, Map, build_index
@@ -23,7 +24,7 @@ class InstanceSet:
     ) -> None:
         self.entries, self.language = entries, language
         self._gmap, self._ids = gmap, ids
-        self._covariance = cache(self._spread)
+        self._covariance, self._box = cache(self._spread), cache(self._recorded_box)
 
     @cached_property
     def index(self) -> InstanceIndex:
@@ -38,7 +39,7 @@ class InstanceSet:
             float(entry["score"]) if score is None else score,
             self.index.of(number),
             np.array(entry["centroid"], np.float64),
-            OrientedBox.from_json(entry["obb"]),
+            self._box(row),
             entry.get("label"),
             self.views(row),
             self._covariance(row),
@@ -65,6 +66,13 @@ class InstanceSet:
     def _view_stops(self) -> np.ndarray:
         """[I] int64: one past the last row of each entry's views."""
         return np.cumsum(self.language["view_counts"], dtype=np.int64)
+
+    def _recorded_box(self, row: int) -> OrientedBox:
+        """The entry's box; of a group, which has none on record, that around its points."""
+        entry = self.entries[row]
+        if "obb" in entry:
+            return OrientedBox.from_json(entry["obb"])
+        return oriented_box(self.index.of(int(entry["id"])), BOX_TRIM)
 
     def _spread(self, row: int) -> np.ndarray:
         """[3, 3] covariance of the entry's points."""

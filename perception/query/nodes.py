@@ -8,7 +8,6 @@ from functools import cached_property
 
 import numpy as np
 
-from perception.boxes import oriented_box
 from perception.language.description import from_arrays
 from perception.language.printed import quoted_text
 from perception.language.shape_words import shape_kind
@@ -58,9 +57,8 @@ class Nodes:
             self._add(kind, True, [[row_of[part["parent"]]] for part in parts])
         if (language := language_in(gmap.groups)) and (gmap.group_ids >= 0).any():
             ids, groups = gmap.group_ids, range(len(gmap.groups["scores"]))
-            points = [gmap.means[ids == g].astype(np.float64) for g in groups]
-            boxes = [{"centroid": x.mean(axis=0), "obb": oriented_box(x, 0.01).to_json()} for x in points]
-            kind = InstanceSet(gmap, [{"id": g, "score": 1.0, **boxes[g]} for g in groups], language, ids)
+            centroids = [gmap.means[ids == g].mean(axis=0, dtype=np.float64) for g in groups]
+            kind = InstanceSet(gmap, [{"id": g, "score": 1.0, "centroid": centroids[g]} for g in groups], language, ids)
             self._add(kind, False, [np.flatnonzero(gmap.groups["of"] == g).tolist() for g in groups])
 
     def _add(self, kind: InstanceSet, is_part: bool, related: list[list[int]]) -> None:
