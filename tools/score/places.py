@@ -1,6 +1,6 @@
 """Maps many places with several seeds, and scores their instances: mean, spread, worst tenth.
 
-python tools score.places WORK [--places NAME …] [--seeds N] [--masks SOURCE] [--name NAME] [--against FILE]
+python tools score.places WORK [--places NAME …] [--seeds N] [--masks SOURCE] [--name NAME] [--against FILE] [--plot PNG]
 
 Places are made scenes of seeds that no training uses, and those of PERCEPTION_DATA. WORK/places keeps the made ones,
 WORK/NAME the maps and WORK/NAME.json the figures, so that a run that was stopped goes on; another NAME for a changed
@@ -34,7 +34,7 @@ from perception.pipeline.mapping import build_map
 from perception.progress import Progress
 from score.instances import MIN_POINTS, read_scene, read_truth_cloud
 from score.photos import overlaps
-from score.reliability import reliability
+from score.reliability import draw, reliability
 from training import clutter, patchwork
 from worlds import scene as scenes
 
@@ -212,6 +212,7 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
     parser.add_argument("--name", help="of the folder of maps and the JSON (that of the masks)")
     parser.add_argument("--against", type=Path, metavar="FILE", help="JSON of another run to compare with")
+    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draws the reliability of scores (matplotlib)")
     parser.add_argument("--cpu-minutes", type=float, default=120, help="after which no other map is begun (120)")
     options = parser.parse_args()
     folder, begun, left = options.work / (options.name or options.masks), time.process_time(), []
@@ -232,6 +233,9 @@ def main() -> None:
         print(f"{place.name} {seed}: {figures}, {one['cpu_seconds']:.0f} CPU s", flush=True)
     maps = [known[place.name, seed] for place, seed in wanted if (place.name, seed) in known]
     print(text_of(maps, read_json(options.against)["maps"] if options.against else []))
+    if options.plot:
+        scored = np.array([pair for one in maps for pair in one.get("scored", [])])
+        draw(reliability(*scored.T), "instances", options.plot)
     if left:
         print(f"left out, as {options.cpu_minutes:g} CPU minutes are spent: {', '.join(left)}")
 

@@ -25,6 +25,7 @@ def parse_pairs(
 ) -> tuple[argparse.Namespace, list[tuple[Path, Path]]]:
     """The options, and the arguments `names` (a map and its scene's folder) by twos; InputError for an odd number."""
     parser.add_argument("paths", type=Path, nargs="+", metavar=names, help="a map and its scene's folder, in turns")
+    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draws the reliability (matplotlib)")
     parser.prog = f"python {sys.argv[0]}"
     options = parser.parse_args(arguments)
     if len(options.paths) % 2:
@@ -47,11 +48,28 @@ def reliability(p: np.ndarray, right: np.ndarray) -> dict[str, Any]:
     return {"ece": float(np.abs(sums[0] - sums[1]).sum() / max(len(p), 1)), "count": len(p), "bins": bins}
 
 
+def draw(found: dict[str, Any], what: str, file: Path) -> None:
+    """The share right against mean p, of bins with their counts, beside the line where both are equal."""
+    from matplotlib import pyplot as plt
+
+    _, axis = plt.subplots(figsize=(4, 4), layout="constrained")
+    axis.plot([0, 1], [0, 1], "-", color="0.7")
+    axis.plot([row["mean"] for row in found["bins"]], [row["right"] for row in found["bins"]], "o-")
+    for row in found["bins"]:
+        axis.annotate(row["count"], (row["mean"], row["right"]), (5, -10), textcoords="offset points", fontsize=7)
+    error = f"{what}: calibration error {found['ece']:.3f} over {found['count']}"
+    axis.set(xlabel="score", ylabel="share right", xlim=(0, 1), ylim=(0, 1.02), title=error)
+    axis.grid(alpha=0.3)
+    plt.savefig(file, dpi=110)
+
+
 def finish_reliability(
     name: str, options: argparse.Namespace, reports: list[dict[str, Any]], lines: list[str], what: str
 ) -> None:
     """As `finish`, with the table of the reliability of all pairs (p, right) in `reports` by SCORED."""
     found = reliability(*np.array([pair for report in reports for pair in report[SCORED]]).reshape(-1, 2).T)
+    if options.plot:
+        draw(found, what, options.plot)
     rows = [{"p": f"{row['low']:.1f} to {row['low'] + 1 / BINS:.1f}", **row} for row in found["bins"]]
     lines = [*lines, f"{what}: expected calibration error {found['ece']:.3f} over {found['count']}"]
     report = (reports[0] if len(reports) == 1 else {"reports": reports}) | {"reliability": found}

@@ -1,6 +1,6 @@
 """Measures minutes against quality over presets and settings of `map`, and draws the Pareto front.
 
-python tools speed.fronts SCENE [--set KEY=VALUE] [--only TEXT] [-o OUTPUT]
+python tools speed.fronts SCENE [--set KEY=VALUE] [--only TEXT] [-o OUTPUT] [--plot FILE.png]
 
 `perception map` runs in a process of its own for each variant. A finished map stays in OUTPUT/maps with its row, named
 by a key of the scene, the settings and the source code, so a stopped sweep goes on. Held-out views are scored at each
@@ -159,12 +159,37 @@ def sweep_parser() -> argparse.ArgumentParser:
     parser.add_argument("--masks", metavar="SOURCE", help="as of `map`; default: SCENE/labels where there, else auto")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
     parser.add_argument("--only", metavar="TEXT", help="only variants with TEXT in their group or name")
+    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draws PSNR and AP against minutes (matplotlib)")
     return parser
+
+
+def draw(rows: Sequence[dict[str, Any]], file: Path) -> None:
+    """PSNR and AP against CPU minutes: a sign for each group, a line through the front; other sizes hollow."""
+    from matplotlib import pyplot as plt
+
+    drawn = [key for key in ("psnr", "ap") if any(row.get(key) is not None for row in rows)]
+    _, axes = plt.subplots(1, len(drawn), figsize=(5.2 * len(drawn), 4.2), layout="constrained", squeeze=False)
+    groups = list(dict.fromkeys(row["group"] for row in rows))
+    for axis, key in zip(axes[0], drawn, strict=True):
+        for n, (group, sign) in enumerate(zip(groups, "osD^vP*", strict=False)):
+            of = [row for row in rows if row["group"] == group and row.get(key) is not None]
+            for row in of:
+                place, fill = (row["cpu_minutes"], row[key]), "none" if "other" in row["front"] else f"C{n}"
+                axis.plot(*place, sign, color=f"C{n}", markerfacecolor=fill, label=group if row is of[0] else None)
+                axis.annotate(row["name"], place, (4, 4), textcoords="offset points", fontsize=7)
+        front = sorted((row["cpu_minutes"], row[key]) for row in rows if key in row["front"].split())
+        axis.plot(*zip(*front, strict=True), "-", color="0.7", zorder=0)
+        axis.set(xlabel="CPU minutes of the whole run", ylabel={"psnr": "held-out PSNR, dB", "ap": "AP"}[key])
+        axis.grid(alpha=0.3)
+    axes[0, -1].legend(fontsize=7, loc="lower right")
+    plt.savefig(file, dpi=110)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Prints the table; JSON goes to the output folder."""
     options = sweep_parser().parse_args(arguments)
+    if options.plot:
+        import matplotlib  # noqa: F401  before minutes of work
     rows = run_sweep(options, variants())
     comparable = [row["max_side"] == rows[0]["max_side"] for row in rows]
     for row, same in zip(rows, comparable, strict=True):
@@ -173,6 +198,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         values = [row.get(key) if same else None for row, same in zip(rows, comparable, strict=True)]
         for index in pareto(list(zip((row["cpu_minutes"] for row in rows), values, strict=True))):
             rows[index]["front"] = f"{rows[index]['front']} {key}".strip()
+    if options.plot:
+        draw(rows, options.plot)
     text = f"{options.scene.name}; on the front (CPU minutes against ...):\n{table(rows, COLUMNS)}"
     finish("fronts", options, {"scene": options.scene.name, "rows": rows}, text)
 
