@@ -1,6 +1,6 @@
 """Maps many places with several seeds, and scores their instances: mean, spread, worst tenth.
 
-python tools score.places WORK [--places NAME …] [--seeds N] [--masks SOURCE] [--name NAME] [--against FILE] [--plot PNG]
+python tools score.places WORK [--places …] [--seeds N] [--masks SOURCE] [--name NAME] [--against FILE] [--plot FILE]
 
 Places are made scenes of seeds that no training uses, and those of PERCEPTION_DATA. WORK/places keeps the made ones,
 WORK/NAME the maps and WORK/NAME.json the figures, so that a run that was stopped goes on; another NAME for a changed
