@@ -84,7 +84,7 @@ def group(
         ids = _without_small(ids, votes, config.min_cluster_size, whole)
         ids = reassign(ids, means, opacities, votes, MIN_OPACITY)
     return_free_memory()
-    return _scored(ids, parts, parents, votes)
+    return scored(ids, parts, parents, votes)
 
 
 def _by_consensus(
@@ -166,7 +166,7 @@ def _shown(groups: MaskVotes) -> np.ndarray:
     return np.bincount(groups.per_entry(first, row)[fits], minlength=groups.pixels.shape[0])
 
 
-def _scored(ids: np.ndarray, parts: np.ndarray, parents: np.ndarray, votes: MaskVotes) -> Grouping:
+def scored(ids: np.ndarray, parts: np.ndarray, parents: np.ndarray, votes: MaskVotes) -> Grouping:
     """Renumbers the instances by size, and scores them and their parts."""
     old = np.append(ids, parents.max(initial=-1))
     ids = by_falling_size(ids)

@@ -6,13 +6,28 @@ from dataclasses import replace
 
 import numpy as np
 
+from perception.instances.assign import reassign
+from perception.instances.cluster import MIN_OPACITY
 from perception.instances.consensus import LARGEST_PART
-from perception.instances.group import Grouping, scored_parts
+from perception.instances.group import Grouping, scored, scored_parts
 from perception.instances.votes import MaskVotes
 from perception.masks.merging import Segmentation
 
 LEAST_PART = 32  # Gaussians; smaller parts are not kept
 ODDS = 2.5  # fitted to the 71 instances of maps of two made worlds
+LEAST_SCORE = 0.1  # instances of less are pieces of others, as a rule
+
+
+def without_faint(
+    grouping: Grouping, means: np.ndarray, opacities: np.ndarray, votes: MaskVotes, cuts: Segmentation
+) -> Grouping:
+    """`with_levels`, in which the Gaussians of instances below LEAST_SCORE are those of their neighbours or of none."""
+    found = with_levels(grouping, means, votes, cuts)
+    faint = np.append(found.scores < LEAST_SCORE, False)  # the last for −1
+    if not faint.any():
+        return found
+    ids = reassign(np.where(faint[found.ids], -1, found.ids), means, opacities, votes, MIN_OPACITY)
+    return with_levels(scored(ids, np.full(len(ids), -1), np.zeros(0, np.int64), votes), means, votes, cuts)
 
 
 def with_levels(grouping: Grouping, means: np.ndarray, votes: MaskVotes, cuts: Segmentation) -> Grouping:

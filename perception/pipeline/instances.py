@@ -16,7 +16,7 @@ from perception.gaussians.views import TrainingView, half_camera
 from perception.instances.crops import choose_views, view_scores
 from perception.instances.describe import describe_instances
 from perception.instances.group import Grouping, group
-from perception.instances.levels import with_levels
+from perception.instances.levels import without_faint
 from perception.instances.silhouettes import Silhouettes, render_silhouettes
 from perception.instances.texts import read_texts, store_texts
 from perception.instances.votes import mask_votes
@@ -64,7 +64,7 @@ def group_gaussians(optimised: Optimised, run: Run, segments: Segmentation | Non
     means, scales, opacities, features = (tensor.detach().numpy() for tensor in tensors)
     margin = config.losses.margin
     grouping = group(means, scales, opacities, features, votes, config.instances, margin=margin, seed=config.seed)
-    return grouping if segments is None else with_levels(grouping, means, votes, segments)
+    return grouping if segments is None else without_faint(grouping, means, opacities, votes, segments)
 
 
 def describe(

@@ -9,7 +9,7 @@ pytest.importorskip("perception._core")
 from scipy import sparse
 
 from perception.instances.group import Grouping
-from perception.instances.levels import ODDS, with_levels
+from perception.instances.levels import ODDS, with_levels, without_faint
 from perception.instances.votes import MaskVotes
 from perception.masks.merging import Segmentation
 
@@ -40,3 +40,28 @@ def test_scores_parts_and_groups_by_the_nearest_voxels() -> None:
     assert found.parents == [0, 0, 1, 1] and found.part_scores == pytest.approx([0.1, 0.2, 0.3, 0.5])
     assert (found.part_ids == np.select([at == v for v in (0, 1, 2, 4)], [3, 4, 5, 6], -1)).all()
     assert found.ids is grouping.ids
+
+
+def test_what_is_hardly_an_object_joins_the_neighbour_whose_masks_show_it() -> None:
+    """Segment 1: 40 Gaussians below x = 1.1 are instance 0, its last 4 instance 1, of an IoU of .09."""
+    cuts = Segmentation(
+        points=np.array([[0, 0, 0], [1, 0, 0], [9, 0, 0]], np.float32),
+        segment=np.array([1, 1, 2], np.int32),
+        probability=np.array([0, 0.3, 0.9]),
+        part=np.arange(3),
+        part_probability=np.zeros(3),
+        group=np.arange(3),
+        group_probability=np.zeros(3),
+    )
+    x = np.concatenate([np.linspace(0, 1.1, 40), np.linspace(1.1, 1.2, 4), np.linspace(8.9, 9.1, 40)])
+    means = np.stack([x, np.zeros(84), np.zeros(84)], axis=1)
+    ids = np.repeat([0, 1, 2], [40, 4, 40]).astype(np.int32)
+    shown = np.repeat([0, 1], [44, 40])  # one photo with two masks, of which the first shows both pieces
+    pixels = sparse.csr_matrix((np.full(84, 9.0, np.float32), (np.arange(84), shown)), shape=(84, 2))
+    votes = MaskVotes(
+        pixels, sparse.csr_matrix((84, 1), dtype=np.float32), np.zeros(2, np.int64), np.array([396.0, 360])
+    )
+    grouping = Grouping(ids, np.ones(84), np.ones(3), np.full(84, -1))
+    found = without_faint(grouping, means, np.ones(84), votes, cuts)
+    assert found.ids.tolist() == [0] * 44 + [1] * 40
+    np.testing.assert_allclose(found.scores, ODDS * (q := np.array([0.3, 0.9])) / (1 - q + ODDS * q))
