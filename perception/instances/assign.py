@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 from scipy import sparse
+from scipy.sparse import csgraph
 
 from perception.instances.votes import MaskVotes
 
@@ -13,6 +14,7 @@ CHUNK, ENTRIES = 20_000, 10_000_000  # Gaussians, and their affinities with all 
 NEIGHBOURS = 8  # nearest voters of a Gaussian
 LEAST_AGREEMENT = 0.5  # affinity with an instance that a Gaussian may join: half of its pixels are in its masks
 MARGIN = 0.15  # affinity by which another instance must be better
+STRAYS, STRAY_SHARE = 16, 0.1  # Gaussians of a piece, and its share of its instance's largest, from which it may stay
 
 
 def mask_shares(groups: MaskVotes) -> sparse.csr_matrix:
@@ -80,6 +82,30 @@ def reassign(
         moves = backed & (own >= 0) & (theirs >= mine + MARGIN)
         assigned[rows] = np.where(joins | moves, popular, own)
     return assigned
+
+
+def without_strays(ids: np.ndarray, means: np.ndarray, opacities: np.ndarray, min_opacity: float) -> np.ndarray:
+    """ids [N] int32 without small pieces apart from their instance: floaters on the rays to it, which lie in its masks.
+
+    means [N, 3], opacities [N]. A Gaussian is linked to those of its NEIGHBOURS nearest voters (`reassign`) that are of
+    its instance. A piece of less than STRAYS Gaussians and STRAY_SHARE of the instance's largest piece gets id −1.
+    """
+    from scipy.spatial import cKDTree
+
+    rows = np.flatnonzero((ids >= 0) & np.isfinite(means).all(axis=1))
+    voters = rows[opacities[rows] >= min_opacity]
+    near = min(NEIGHBOURS + 1, len(voters))
+    if near < 2:
+        return ids
+    others = voters[cKDTree(means[voters]).query(means[rows], k=near, workers=-1)[1]]
+    row, place = np.nonzero(ids[others] == ids[rows][:, None])
+    links = sparse.coo_matrix((np.ones(len(row), bool), (rows[row], others[row, place])), shape=(len(ids), len(ids)))
+    piece = csgraph.connected_components(links, directed=False)[1]
+    size = np.bincount(piece)[piece]
+    largest = np.zeros(ids.max() + 1, np.int64)
+    np.maximum.at(largest, ids[rows], size[rows])
+    strays = (ids >= 0) & (size < STRAYS) & (size < STRAY_SHARE * largest[np.maximum(ids, 0)])
+    return np.where(strays, -1, ids).astype(np.int32)
 
 
 def _mode(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

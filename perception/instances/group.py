@@ -14,7 +14,7 @@ import numpy as np
 
 from perception.config import InstanceConfig
 from perception.geometry import sums_by
-from perception.instances.assign import LEAST_AGREEMENT, memberships, reassign
+from perception.instances.assign import LEAST_AGREEMENT, memberships, reassign, without_strays
 from perception.instances.cluster import MIN_OPACITY, by_falling_size, cluster_gaussians
 from perception.instances.confidence import calibrated, raw_scores
 from perception.instances.consensus import best_cut, dendrogram, evidence, node_evidence, parts_of
@@ -83,6 +83,7 @@ def group(
         ids = reassign(ids, means, opacities, votes, MIN_OPACITY)
         ids = _without_small(ids, votes, config.min_cluster_size, whole)
         ids = reassign(ids, means, opacities, votes, MIN_OPACITY)
+        ids = without_strays(ids, means, opacities, MIN_OPACITY)
     return_free_memory()
     return scored(ids, parts, parents, votes)
 

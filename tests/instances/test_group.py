@@ -15,6 +15,7 @@ pytest.importorskip("perception._core")
 from perception.config import InstanceConfig
 from perception.gaussians.model import Nearby, from_points
 from perception.gaussians.views import TrainingView
+from perception.instances.assign import without_strays
 from perception.instances.group import Grouping, _without_small, group
 from perception.instances.votes import MaskVotes, beside, mask_votes
 from perception.rasterizer.rasterize import rasterize
@@ -261,3 +262,24 @@ def test_a_ring_is_kept_that_two_photos_show_though_its_gaussians_fill_a_fifth_o
     kept = _without_small(ids, votes, 32, whole=True)
     assert (kept[:40] == 0).all()
     assert (kept[40:] == (1 if photos == 2 else -1)).all()
+
+
+def test_floaters_are_strays_and_a_part_behind_something_is_none() -> None:
+    """Instance 0: a ball of 60, 5 floaters far off and a piece of 20 beyond instance 1, which is a ball of 60."""
+    rng = np.random.default_rng(0)
+    places = [((0, 0, 0), 60, 0), ((9, 0, 0), 20, 0), ((5, 0, 0), 60, 1), ((5, 7, 0), 1, 0), ((5, 0, 1.5), 4, 0)]
+    means = np.concatenate([rng.normal(size=(count, 3)) * 0.3 + middle for middle, count, _ in places])
+    means[60 + 20 + 60 + 1 :] = means[80 : 80 + 4] + 1e-3  # four floaters among the Gaussians of instance 1
+    ids = np.repeat([own for *_, own in places], [count for _, count, _ in places]).astype(np.int32)
+    found = without_strays(ids, means, np.ones(len(ids)), 0.1)
+    expected = ids.copy()
+    expected[140:] = -1
+    np.testing.assert_array_equal(found, expected)
+    order = rng.permutation(len(ids))
+    np.testing.assert_array_equal(without_strays(ids[order], means[order], np.ones(len(ids)), 0.1), expected[order])
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_few_gaussians_have_no_strays(count: int) -> None:
+    ids, means = np.zeros(count, np.int32), np.arange(3.0 * count).reshape(count, 3)
+    np.testing.assert_array_equal(without_strays(ids, means, np.ones(count), 0.1), ids)
