@@ -51,3 +51,9 @@ def test_the_gaussians_in_view_are_those_that_project_into_it() -> None:
     )  # fmt: skip
     means = np.array([[0, 0, 1.0], [1.9, 0, 1], [2.5, 0, 1], [0, 0, -1], [2.5, 0, 1]])
     assert in_view(means, np.array([0.01, 0.01, 0.01, 0.01, 0.2]), [view]).tolist() == [True, True, False, False, True]
+
+
+def test_a_spot_where_no_photo_looks_is_worse_than_one_that_photos_contradict() -> None:
+    (there,) = signs_of([shown(3.0, same=False)], [7], np.ones(1), np.array([0.1]))
+    (hidden,) = signs_of([shown(2.0, cover=30)], [7], np.ones(1), np.array([0.1]))
+    assert not hidden.photos and hidden.same < there.same < 0
