@@ -30,6 +30,9 @@ SOLID = 0.1
 """Least opacity of a Gaussian that shows a surface."""
 REACH = 2.2
 """Radii of a thing (root of the mean squared distance to its centre) within which all of it lies."""
+STRAY = 3.0
+"""Median distances to the middle of a thing from which a point is a stray: the ends of a rod are at 2, of a cross at 2,
+the rim of a plate at 1.4."""
 ROUND, DARKEST = 1.6, 0.1
 """Distance of the points of a thing after a turn, relative to that between its halves, up to which it may be round:
 bowls and plates have 1.1 to 1.4, cans and cartons, whose print the photos see, 1.4 to 2.4. Least sum of colours of a
@@ -73,6 +76,15 @@ class Points:
         """An even selection of at most about `count` points."""
         every = max(1, len(self.points) // count)
         return Points(self.points[::every], self.colors[::every])
+
+
+def compact(points: np.ndarray) -> np.ndarray:
+    """[P] bool: points [P, 3] of a thing that are no strays, such as floaters on the rays to it."""
+    kept = np.ones(len(points), bool)
+    for _ in range(2 if len(points) else 0):
+        distance = np.linalg.norm(points - np.median(points[kept], axis=0), axis=1)
+        kept = distance <= STRAY * np.median(distance[kept])
+    return kept
 
 
 def register(old: Points, new: Points, up: np.ndarray) -> list[tuple[float, np.ndarray]]:

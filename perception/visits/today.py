@@ -223,7 +223,7 @@ def _settled(
         [part_ids[stays]],
     )
     for i, (_, motion) in pairs.items():
-        own = np.flatnonzero(gmap.instance_ids == i)
+        own = visit.rows_of(i)
         pieces.append(carried(visit.thing(i), motion.new_from_old))
         names.append(np.full(len(own), i, np.int32))
         members.append(gmap.membership[own])

@@ -19,6 +19,7 @@ from perception.masks.stereo import StereoView
 from perception.pipeline.checkpoint import digest, training_mark
 from perception.pipeline.optimise import Photos, Run, label_photos
 from perception.visits.look import Look, compared, depth_at, in_light, in_view, look, stereo_of, with_exposure
+from perception.visits.registration import compact
 from perception.visits.scene import foreign_photos, refuse_older, visit_scene
 
 TENSORS = ("means", "quats", "log_scales", "opacity_logits", "sh", "features")
@@ -52,9 +53,14 @@ class Visit:
         """[R] int32 instance of each of `gaussians`, −1 = none."""
         return self.gmap.instance_ids[self.rows]
 
+    def rows_of(self, instance: int) -> np.ndarray:
+        """[R] rows of the map's Gaussians of an instance that are no strays."""
+        rows = np.flatnonzero(self.gmap.instance_ids == instance)
+        return rows[compact(self.gmap.means[rows].astype(np.float64))]
+
     def thing(self, instance: int) -> Gaussians:
-        """All Gaussians of an instance of the map, in the light of the visit."""
-        return in_light(gaussians_of(self.gmap, np.flatnonzero(self.gmap.instance_ids == instance)), self.light)
+        """These Gaussians, in the light of the visit."""
+        return in_light(gaussians_of(self.gmap, self.rows_of(instance)), self.light)
 
     @property
     def frames(self) -> list[tuple[TrainingView, np.ndarray]]:

@@ -12,7 +12,7 @@ from perception.gaussians.model import Gaussians, isotropic
 from perception.gaussians.views import TrainingView, render
 from perception.instances.group import Grouping
 from perception.visits.motion import Cut, assigned, judged, refined
-from perception.visits.registration import Points, angle_between, carried, looks_round, register
+from perception.visits.registration import Points, angle_between, carried, compact, looks_round, register
 from perception.visits.today import _without_fragments
 from support.aimed import look_at
 
@@ -43,6 +43,20 @@ def test_a_known_motion_is_found_from_a_part_of_the_thing() -> None:
     moved = again.points @ true[:3, :3].T + true[:3, 3]
     residual, found = register(old, Points(moved[seen], again.colors[seen]), UP)[0]
     assert angle_between(found, true) < 3 and np.linalg.norm(found[:3, 3] - true[:3, 3]) < 0.004 and residual < 0.2
+
+
+def test_floaters_far_from_a_thing_are_strays_and_no_part_of_common_shapes_is_one() -> None:
+    rng = np.random.default_rng(3)
+    x = rng.uniform(-1, 1, (400, 3))
+    box = thing(rng).points
+    pan = np.concatenate([x[:300] * [0.2, 0.2, 0.02], x[300:] * [0.2, 0.02, 0.02] + [0.4, 0, 0]])  # with its handle
+    for points in (x * [1, 0.02, 0.02], x * [1, 1, 0.01], x / np.linalg.norm(x, axis=1)[:, None], box, pan):
+        assert compact(points).all()
+        size = np.ptp(points, axis=0).max()
+        floaters = rng.uniform(3, 9, (len(points) // 5, 3)) * size
+        kept = compact(np.concatenate([points, floaters]))
+        assert kept[: len(points)].all() and not kept[len(points) :].any()
+    assert compact(np.zeros((0, 3))).shape == (0,)
 
 
 def test_a_carried_thing_looks_as_the_thing_does_from_the_carried_camera() -> None:
