@@ -15,7 +15,7 @@ from perception.masks.merging import Segmentation
 
 LEAST_PART = 32  # Gaussians; smaller parts are not kept
 ODDS = 2.5  # fitted to the 71 instances of maps of two made worlds
-LEAST_SCORE = 0.1  # instances of less are pieces of others, as a rule
+LEAST_SCORE = 0.05  # instances of less are pieces of others, as a rule; from 0.1 on, small things are lost too
 
 
 def without_faint(

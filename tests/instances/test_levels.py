@@ -47,7 +47,7 @@ def test_what_is_hardly_an_object_joins_the_neighbour_whose_masks_show_it() -> N
     cuts = Segmentation(
         points=np.array([[0, 0, 0], [1, 0, 0], [9, 0, 0]], np.float32),
         segment=np.array([1, 1, 2], np.int32),
-        probability=np.array([0, 0.3, 0.9]),
+        probability=np.array([0, 0.2, 0.9]),
         part=np.arange(3),
         part_probability=np.zeros(3),
         group=np.arange(3),
@@ -64,4 +64,4 @@ def test_what_is_hardly_an_object_joins_the_neighbour_whose_masks_show_it() -> N
     grouping = Grouping(ids, np.ones(84), np.ones(3), np.full(84, -1))
     found = without_faint(grouping, means, np.ones(84), votes, cuts)
     assert found.ids.tolist() == [0] * 44 + [1] * 40
-    np.testing.assert_allclose(found.scores, ODDS * (q := np.array([0.3, 0.9])) / (1 - q + ODDS * q))
+    np.testing.assert_allclose(found.scores, ODDS * (q := np.array([0.2, 0.9])) / (1 - q + ODDS * q))
