@@ -137,4 +137,4 @@ def sums_by(index: np.ndarray, values: np.ndarray, count: int, weights: np.ndarr
     """Sums [count, ...] float64 of values [P, ...] with the same index [P], in their order, times weights [P]."""
     columns = values.reshape(len(values), math.prod(values.shape[1:])).T
     sums = [np.bincount(index, column if weights is None else weights * column, count) for column in columns]
-    return np.stack(sums, axis=1).reshape(count, *values.shape[1:])
+    return np.stack(sums, axis=1).astype(np.float64, copy=False).reshape(count, *values.shape[1:])  # int64 of no values
