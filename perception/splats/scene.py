@@ -20,8 +20,9 @@ from perception.inputs.transforms import read_frames
 from perception.photos.decode import load_photo, scaled_K
 from perception.photos.views import make_view
 from perception.sfm.options import ReadOptions
-from perception.splats.cameras import FOCAL, choose_views, intrinsics, proxy_of, survey
+from perception.splats.cameras import FOCAL, choose_views, intrinsics
 from perception.splats.gravity import direction
+from perception.splats.panoramas import proxy_of, survey
 from perception.splats.read import Splat
 from perception.splats.surface import hide, sampled
 from perception.types import DepthImage, Scene, View

@@ -13,7 +13,7 @@ import torch
 from perception.errors import InputError
 from perception.photos.depth import load_depth
 from perception.sfm.options import ReadOptions
-from perception.splats.cameras import pose_at
+from perception.splats.panoramas import pose_at
 from perception.splats.read import Splat, read_splat
 from perception.splats.scene import _cloud, _given, _with_renders, drawn
 from perception.types import View

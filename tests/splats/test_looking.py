@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from perception.errors import InputError
 from perception.geometry import camera_centres
-from perception.splats.cameras import FIVE, Chosen, Survey, choose_views, proxy_of, survey
+from perception.splats.cameras import FIVE, Chosen, choose_views
 from perception.splats.gravity import direction
+from perception.splats.panoramas import Survey, _grid, proxy_of, survey
 from perception.splats.read import Splat, read_splat
 from perception.splats.scene import drawn, rendered
 from perception.splats.surface import floaters
@@ -63,6 +64,30 @@ def test_cameras_stand_in_the_room_and_see_it_all(tmp_path: Path, name: str, cei
         times += inside & (np.abs(depth[row, column] - z) < 0.06)
     assert np.mean(times >= FIVE) > 0.8
     assert np.mean(times[thing >= 2] >= 2) > 0.9
+
+
+@pytest.mark.slow
+def test_a_thing_in_empty_space_is_seen_from_all_sides(tmp_path: Path) -> None:
+    """A table with two boxes and nothing around it, as a scan of one thing is."""
+    columns, thing = room_columns()
+    splat = read_splat(write_room(tmp_path / "thing.ply", {name: x[thing > 0] for name, x in columns.items()}))
+    found, chosen = looked(splat, floaters(splat), np.array([0.0, 0, 1]))
+    assert not found.inside and len(found.places) < 400
+    away = camera_centres(chosen.poses) - TABLE[1]
+    assert np.all(np.linalg.norm(away, axis=1) < 6)
+    yaw = np.sort(np.arctan2(away[:, 1], away[:, 0]))
+    assert np.diff(np.append(yaw, yaw[0] + 2 * np.pi)).max() < np.pi / 2
+
+
+@pytest.mark.parametrize("side", [(1, 1, 1), (4, 3, 1e-3), (9, 0.1, 0.1), (2, 0, 0), (5, 3), (1, 0)])
+@pytest.mark.parametrize("count", [64, 240])
+def test_a_grid_has_about_as_many_places_as_asked_for(side: tuple[float, ...], count: int) -> None:
+    low = np.arange(1.0, 1 + len(side))
+    places = _grid(low, low + side, count)
+    assert count / 4 <= len(places) <= 4 * count
+    reach = np.maximum(side, 0.05 * max(side)) / 2 + 1e-9
+    assert np.all(np.abs(places - low - np.array(side) / 2) <= reach)
+    assert len(np.unique(places, axis=0)) == len(places)
 
 
 @pytest.mark.slow

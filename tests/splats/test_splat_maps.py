@@ -10,7 +10,7 @@ import pytest
 from perception.cli import main
 from perception.io.ply import map_ply, read_ply
 from perception.map.write import Map, read_map
-from perception.splats import cameras
+from perception.splats import cameras, panoramas
 from support.splat_rooms import room_columns, write_room
 
 BAD = [7, 1000]
@@ -27,7 +27,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, np.ndarr
     source, output = write_room(folder / "room.ply", columns), folder / "room.gsmap"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cameras, "MOST_VIEWS", 24)
-        patch.setattr(cameras, "PLACES", 120)
+        patch.setattr(panoramas, "PLACES", 120)
         assert main(["map", str(source), "-o", str(output), *OPTIONS, "--set", "train.iterations=300"]) == 0
     return source, output, thing
 
