@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from perception.bench.output import Column, table
+from perception.boxes import oriented_box
 from perception.config import MapConfig, load_config
 from perception.errors import InputError
 from perception.io.atomic import atomic_file
@@ -47,6 +48,7 @@ SHORT = ("photos.max_side=320", "train.iterations=800", "train.budget=40000", "l
 GROWN, INSIDE, COVERED, NEAR = 0.05, 0.5, 0.25, 0.03
 """A thing with a hand-made box is found by an instance with INSIDE of its points in the box, grown by GROWN metres, and
 within NEAR of COVERED of the thing's points."""
+OFF = 1.5
 FIGURES = ("ap", "ap50", "ap25", "own")
 HEADS = ("AP", "AP50", "AP25", "own")
 
@@ -117,8 +119,22 @@ def score(gmap: Map, folder: Path) -> dict[str, Any]:
     return {
         **{name: float(found[name]) for name in ("ap", "ap50", "ap25")},
         "scored": right[overlap.pred_sizes >= MIN_POINTS].tolist(),
+        "boxes": box_ratios(gmap, cloud.points[truth >= 0], truth[truth >= 0], labels[truth >= 0]),
         "missed": [names[i] for i, iou in zip(true.ids, overlap.iou.max(axis=0, initial=0), strict=True) if iou <= 0.5],
     }
+
+
+def box_ratios(gmap: Map, points: np.ndarray, truth: np.ndarray, labels: np.ndarray) -> list[float]:
+    """Of each thing that an instance finds with IoU > 0.5, the diagonal of the instance's box over that of the box of
+    the thing's points. points [P, 3]; truth, labels [P]: ids, the latter −1 = none."""
+    diagonal = {entry["id"]: float(np.linalg.norm(entry["obb"]["extent"])) for entry in gmap.instances}
+    ratios = []
+    for thing in np.unique(truth):
+        own = truth == thing
+        best = np.bincount(labels[own & (labels >= 0)], minlength=1).argmax()
+        if (own & (labels == best)).sum() > 0.5 * (own | (labels == best)).sum():
+            ratios.append(diagonal[int(best)] / float(np.linalg.norm(oriented_box(points[own]).extent)))
+    return ratios
 
 
 def share_found(gmap: Map, folder: Path) -> float:
@@ -185,6 +201,12 @@ def text_of(maps: list[dict[str, Any]], against: list[dict[str, Any]]) -> str:
     if pairs:
         found = reliability(*np.array(pairs).T)
         lines.append(f"scores of instances: expected calibration error {found['ece']:.3f} over {found['count']}")
+    ratios = np.array([ratio for one in maps for ratio in one.get("boxes", [])])
+    if len(ratios):
+        wrong = np.mean((ratios > OFF) | (ratios < 1 / OFF))
+        lines.append(
+            f"boxes of things found: {wrong:.1%} of {len(ratios)} are more than {OFF} times too large or small"
+        )
     if against:
         both = {_key(one) for one in maps} & {_key(one) for one in against}
         now, then = ({r["place"]: r for r in rows_of([m for m in run if _key(m) in both])} for run in (maps, against))
