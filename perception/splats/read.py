@@ -91,7 +91,11 @@ def _ply_rows(path: Path) -> Mapping[str, np.ndarray]:
     names = {p.name for p in tables["vertex"].properties} if "vertex" in tables else set()
     if "face" in tables and tables["face"].rows:
         raise InputError(f"{path}: is a mesh; {_REFUSED}. `perception export MAP --points {path.name}` labels a mesh")
-    if "packed_position" not in names and not {"x", "y", "z", "opacity", "scale_0", "scale_1"} <= names:
+    missing = {"x", "y", "z", "opacity", "scale_0", "scale_1"} - names
+    if "packed_position" not in names and missing and names & {"opacity", "scale_0", "rot_0", "f_dc_0"}:
+        lacking = " ".join(sorted(missing))
+        raise InputError(f"{path}: lacks the properties {lacking} of a Gaussian splat; write the file anew with them")
+    if "packed_position" not in names and missing:
         found = "a cloud of points without opacity and scales" if {"x", "y", "z"} <= names else "no Gaussians"
         todo = "train a splat of its photos, or give the photos; `perception export MAP --points` labels a cloud"
         raise InputError(f"{path}: holds {found} (properties: {brief(' '.join(sorted(names)))}); {_REFUSED}. {todo}")

@@ -174,6 +174,9 @@ def test_what_is_no_splat_is_told(tmp_path: Path) -> None:
     values = columns(0)
     cloud = write(tmp_path / "cloud.ply", {name: values[name] for name in "xyz"})
     assert "cloud of points" in refused(cloud)
+    for name in ("opacity", "scale_1"):
+        cut = write(tmp_path / "cut.ply", {other: v for other, v in values.items() if other != name})
+        assert f"lacks the properties {name} of" in refused(cut)
     vertex = PlyElement.describe(np.zeros(3, [(n, "f4") for n in "xyz"]), "vertex")
     face = PlyElement.describe(np.array([([0, 1, 2],)], [("vertex_indices", "i4", (3,))]), "face")
     PlyData([vertex, face]).write(str(tmp_path / "mesh.ply"))

@@ -1,12 +1,14 @@
 """Maps many places with several seeds, and scores their instances: mean, spread, worst tenth.
 
-python tools score.places WORK [--places …] [--seeds N] [--masks SOURCE] [--name NAME] [--against FILE] [--plot FILE]
+python tools score.places WORK [--places …] [--seeds N] [--masks SOURCE] [--name NAME] [--against FILE] [--splats NAME]
 
 Places are made scenes of seeds that no training uses, and those of PERCEPTION_DATA. WORK/places keeps the made ones,
 WORK/NAME the maps and WORK/NAME.json the figures, so that a run that was stopped goes on; another NAME for a changed
 program. AP is class-agnostic by ScanNet's rules. Where only things are known (kitchen, shelf) `own` is the share of
-the things that some instance finds, or the mean of their IoU in the photos. Spread: standard deviation over the seeds;
-over all places, its root mean square. Worst: mean of the lowest tenth of the maps, at least of one.
+the things that some instance finds, or the mean of their IoU in the photos. --splats NAME maps the Gaussians alone of
+WORK/NAME's maps again, as finished splats, scored in these maps' frame; --against WORK/NAME.json is then what is lost.
+Spread: standard deviation over the seeds; over all places, its root mean square. Worst: mean of the lowest tenth of the
+maps, at least of one.
 """
 
 from __future__ import annotations
@@ -97,18 +99,19 @@ def config_of(place: Place, seed: int, masks: str, pairs: Iterable[str]) -> MapC
     return load_config(None, [*SHORT, *sides, *pairs, f"masks={source}", f"seed={seed}"])
 
 
-def score(gmap: Map, folder: Path) -> dict[str, Any]:
-    """FIGURES that the scene's truth gives, and (score, right) of the instances where each point's truth is known."""
+def score(gmap: Map, folder: Path, frame: Map | None = None) -> dict[str, Any]:
+    """FIGURES that the scene's truth gives, in the frame of another map if one is given, and (score, right) of the
+    instances where each point's truth is known."""
     about = read_scene(folder)
     if "things" in about:
         truths, things = LabelFolder(folder / "masks_gt"), [int(thing) for thing in about["things"]]
         return {"own": float(overlaps(gmap, gmap.instance_ids, truths, things).max(axis=1).mean())}
     if (folder / "points.npz").is_file():
-        return {"own": share_found(gmap, folder)}
+        return {"own": share_found(gmap, folder, frame)}
     from perception.evaluate.instances import evaluate, overlap_of_ids, read_truth
     from perception.export.export_map import export_labels
 
-    cloud = read_truth_cloud(folder, gmap)
+    cloud = read_truth_cloud(folder, frame or gmap)
     truth = cloud.labels["instance_id"]
     labels = export_labels(gmap.means, gmap.instance_ids, cloud)
     confidence = {entry["id"]: float(entry["score"]) for entry in gmap.instances}
@@ -137,14 +140,14 @@ def box_ratios(gmap: Map, points: np.ndarray, truth: np.ndarray, labels: np.ndar
     return ratios
 
 
-def share_found(gmap: Map, folder: Path) -> float:
-    """Share of the things of scene.json, which have boxes and points, that some instance finds."""
+def share_found(gmap: Map, folder: Path, frame: Map | None = None) -> float:
+    """Share of the things of scene.json, which have boxes and points, that some instance finds; frame: see `score`."""
     from scipy.spatial import cKDTree
 
     things = [entry for entry in read_scene(folder)["instances"] if not entry["is_stuff"]]
     with np.load(folder / "points.npz") as stored:
         points, owners = stored["points"].astype(np.float64), stored["instance"]
-    origin = np.asarray(gmap.info.get("scene", {}).get("origin", (0, 0, 0)), np.float64)
+    origin = np.asarray((frame or gmap).info.get("scene", {}).get("origin", (0, 0, 0)), np.float64)
     found = np.zeros(len(things), bool)
     for entry in gmap.instances:
         mine = gmap.means[gmap.instance_ids == entry["id"]].astype(np.float64) + origin
@@ -234,6 +237,7 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
     parser.add_argument("--name", help="of the folder of maps and the JSON (that of the masks)")
     parser.add_argument("--against", type=Path, metavar="FILE", help="JSON of another run to compare with")
+    parser.add_argument("--splats", metavar="NAME", help="maps the splats of the maps in WORK/NAME again")
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draws the reliability of scores (matplotlib)")
     parser.add_argument("--cpu-minutes", type=float, default=120, help="after which no other map is begun (120)")
     options = parser.parse_args()
@@ -268,10 +272,12 @@ def map_and_score(place: Place, seed: int, options: argparse.Namespace, folder: 
     folder.mkdir(parents=True, exist_ok=True)
     config, started = config_of(place, seed, options.masks, options.pairs), time.process_time()
     path = folder / f"{place.name}-{seed}.gsmap"
-    gmap = build_map(place.source, path, config, resume=path.is_dir(), progress=Progress(quiet=True))
+    given = options.work / options.splats / path.name if options.splats else None
+    source, frame = (given / "gaussians.ply", Map.open(given)) if given else (place.source, None)
+    gmap = build_map(source, path, config, resume=path.is_dir(), progress=Progress(quiet=True))
     spent = time.process_time() - started
     facts = {"place": place.name, "seed": seed, "set": options.pairs, "masks": options.masks}
-    return {**facts, "instances": len(gmap.instances), "cpu_seconds": spent, **score(gmap, place.folder)}
+    return {**facts, "instances": len(gmap.instances), "cpu_seconds": spent, **score(gmap, place.folder, frame)}
 
 
 if __name__ == "__main__":
