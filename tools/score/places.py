@@ -76,7 +76,7 @@ class Place:
 
     def has(self, masks: str) -> bool:
         """Whether it has such masks."""
-        return masks == "builtin" or bool(self.kind) or (self.folder / masks).is_dir()
+        return masks.startswith("builtin") or bool(self.kind) or (self.folder / masks).is_dir()
 
 
 def places(work: Path, names: Iterable[str] = ()) -> list[Place]:
@@ -93,8 +93,8 @@ def places(work: Path, names: Iterable[str] = ()) -> list[Place]:
 
 
 def config_of(place: Place, seed: int, masks: str, pairs: Iterable[str]) -> MapConfig:
-    """The settings of one map; masks: builtin, labels or labels_sam, the latter two those of the place."""
-    source = masks if masks == "builtin" else f"labels:{place.folder / masks}"
+    """The settings of one map; masks: as of `map`, or labels or labels_sam, those of the place."""
+    source = masks if masks.startswith("builtin") else f"labels:{place.folder / masks}"
     sides = ["photos.max_side=480"] if place.kind == "trifles" else []
     return load_config(None, [*SHORT, *sides, *pairs, f"masks={source}", f"seed={seed}"])
 
@@ -233,7 +233,7 @@ def main() -> None:
     parser.add_argument("work", type=Path)
     parser.add_argument("--places", nargs="+", default=[], metavar="NAME", help="some of them (all)")
     parser.add_argument("--seeds", type=int, default=3, help="maps of each place (3)")
-    parser.add_argument("--masks", default="builtin", choices=("builtin", "labels", "labels_sam"))
+    parser.add_argument("--masks", default="builtin", choices=("builtin", "builtin:borders", "labels", "labels_sam"))
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
     parser.add_argument("--name", help="of the folder of maps and the JSON (that of the masks)")
     parser.add_argument("--against", type=Path, metavar="FILE", help="JSON of another run to compare with")
