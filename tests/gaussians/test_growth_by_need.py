@@ -48,7 +48,8 @@ def test_the_full_half_gets_most_of_the_gaussians_and_a_plain_wall_ends_growth()
     plain, full = int((x < -0.05).sum()), int((x > 0.05).sum())
     assert full > 4 * plain
 
-    # The same cameras in front of the plain part alone: fewer Gaussians, and an end before the course is over.
+    # The same cameras in front of the plain part alone: as few for its area, which is twice that of a half, and an end
+    # before the course is over. The step at which growth ends depends on the processor's rounding.
     wall = trained([photographed(x - 3.0, y) for x, y in places], [photographed(-3.0, 0.0)])
-    assert len(wall.gaussians) < len(both.gaussians) / 5
+    assert full > 4 * len(wall.gaussians) / 2
     assert wall.iteration < 400 and any(text.startswith("stop: 10 %") for text in wall.record.decisions)

@@ -154,7 +154,10 @@ def test_each_thing_of_a_row_is_one_instance_also_on_seams(row: Path, whole: Map
     seams = {x for block in whole.info["blocks"] for x in (block["box"][0][0], block["box"][1][0]) if x is not None}
     assert any(abs(x - ball) < 0.3 for x in seams for ball in range(BALLS)), seams  # a seam goes through a ball
     solid = whole.opacities > 0.3
-    ball = np.argmin(np.linalg.norm(whole.means[:, None] - centres(BALLS), axis=2), axis=1)
+    away = np.linalg.norm(whole.means[:, None] - centres(BALLS), axis=2)
+    ball = np.argmin(away, axis=1)
+    # The points lie at .3. What lies between the balls is background, how much of it depends on the processor's rounding.
+    solid &= away.min(axis=1) < 0.45
     owners = [np.bincount(whole.instance_ids[solid & (ball == n)] + 1) for n in range(BALLS)]
     # Gaussians of the black background, which no mask shows, may be an instance too, with a score of about .3.
     things = sum(entry["score"] > 0.5 for entry in whole.instances)
