@@ -156,7 +156,7 @@ def test_each_thing_of_a_row_is_one_instance_also_on_seams(row: Path, whole: Map
     solid = whole.opacities > 0.3
     away = np.linalg.norm(whole.means[:, None] - centres(BALLS), axis=2)
     ball = np.argmin(away, axis=1)
-    # The points lie at .3. What lies between the balls is background, how much of it depends on the processor's rounding.
+    # The points lie at .3. Between the balls is background, how much of it depends on the processor's rounding.
     solid &= away.min(axis=1) < 0.45
     owners = [np.bincount(whole.instance_ids[solid & (ball == n)] + 1) for n in range(BALLS)]
     # Gaussians of the black background, which no mask shows, may be an instance too, with a score of about .3.
