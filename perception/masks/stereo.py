@@ -34,10 +34,11 @@ ANGLE, NARROWER, WIDER = 12.0, 5.0, 10.0  # degrees between rays: best one, stan
 class StereoView:
     """One photo. photo: [h, w, 3] uint8 RGB; grey: [h, w] uint8; K: [3, 3]; camera_from_world: [4, 4] float64.
 
-    prior: [h, w] depth known before stereo, 0 = none. depth: [h, w] current best depth. confirmed: [h, w] bool, pixels
-    whose depth other photos agree with. measured: the prior comes from a sensor. learned: [3, h, w] float16, see
-    `boundaries`, set by `fuse`. voxel: [h, w] int32, the voxel of the surface that each pixel shows, −1 = none, set by
-    `surface_graph`. keep: where images that are made later are kept.
+    prior: [h, w] depth known before stereo, 0 = none. preferred: the prior where stereo prefers it, 0 = nowhere near.
+    depth: [h, w] current best depth. confirmed: [h, w] bool, pixels whose depth other photos agree with. measured: the
+    prior comes from a sensor. learned: [3, h, w] float16, see `boundaries`, set by `fuse`. voxel: [h, w] int32, the
+    voxel of the surface that each pixel shows, −1 = none, set by `surface_graph`. keep: where images that are made
+    later are kept.
     """
 
     name: str
@@ -46,6 +47,7 @@ class StereoView:
     K: np.ndarray
     camera_from_world: np.ndarray
     prior: np.ndarray
+    preferred: np.ndarray
     depth: np.ndarray
     confirmed: np.ndarray
     measured: bool = False
@@ -84,8 +86,8 @@ def make_stereo_view(view: View, photo: np.ndarray, depth: np.ndarray, keep: Kee
     grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
     pose = np.asarray(view.camera_from_world, np.float64)
     measured = view.depth is not None
-    filled, known = keep(filled_depth(prior)), keep(prior > 0)
-    return StereoView(view.name, keep(small), keep(grey), K, pose, keep(prior), filled, known, measured, keep=keep)
+    filled, known, prior = keep(filled_depth(prior)), keep(prior > 0), keep(prior)
+    return StereoView(view.name, keep(small), keep(grey), K, pose, prior, prior, filled, known, measured, keep=keep)
 
 
 def measure_depths(views: list[StereoView], progress: Progress = QUIET, stage: str = "masks (stereo)") -> None:
@@ -107,7 +109,7 @@ def sweep(view: StereoView, others: list[StereoView]) -> np.ndarray:
     """[h, w] float32 depth of `view` from its neighbours `others`, dense.
 
     The matching cost of a pixel at a plane is (1 − mean of its two best correlations over 7×7 pixels) / 2, plus a cost
-    per plane of distance from the prior depth. Semi-global aggregation (Hirschmüller 2008, eq. 13) sums the costs of
+    per plane of distance from the preferred depth. Semi-global aggregation (Hirschmüller 2008, eq. 13) sums the costs of
     paths from the left, the right, above and below; steps to distant planes cost less where the photo has a gradient.
     """
     inverse = plane_depths(view.prior)
@@ -115,7 +117,7 @@ def sweep(view: StereoView, others: list[StereoView]) -> np.ndarray:
     maps = np.array([homographies(view, other) for other in others])
     step = (inverse[-1] - inverse[0]) / (PLANES - 1)
     greys = [other.grey for other in others]
-    _core.plane_sweep(view.grey, greys, maps, view.prior, inverse[0], step, PLANES, depth)
+    _core.plane_sweep(view.grey, greys, maps, view.preferred, inverse[0], step, PLANES, depth)
     return depth
 
 

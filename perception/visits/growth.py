@@ -19,15 +19,13 @@ from perception.instances.votes import MaskVotes
 from perception.pipeline.checkpoint import TrainingObserver
 from perception.pipeline.optimise import Photos, Run
 from perception.visits.evidence import AGREE, LEAST_PIXELS, WEIGHTS
-from perception.visits.look import Look, correlation
+from perception.visits.look import DIFFERENT, Look, correlation
 
 GROWING, SETTLING = 0.16, 0.1
 """Iterations of the two legs of an update, relative to those of a new map."""
 LEAST_ITERATIONS = 100
 SHIFTED = 0.01
 """Relative difference of depth from which a pixel of a mask that the map does not explain shows a new surface."""
-DIFFERENT = 0.1
-"""Mean difference of colour, of 1, from which such a pixel does, whatever its depth."""
 SPARE = 3
 """Gaussians that may grow in an update, relative to those that it starts from."""
 

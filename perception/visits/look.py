@@ -22,7 +22,8 @@ WINDOW = 3.0
 """Standard deviation in pixels of the window in which brightness is compared: a few times the error of a silhouette."""
 DARK, BRIGHT = 0.04, 0.96
 """Colours beyond are clipped or mostly noise, and do not show the exposure."""
-LEAST_OPAQUE = 0.5
+DIFFERENT = 0.1
+"""Mean difference of colour, of 1, from which a pixel shows something else than the map."""
 
 
 @dataclass(frozen=True)
@@ -57,20 +58,24 @@ def compared(view: TrainingView) -> TrainingView:
 
 
 def stereo_of(
-    gaussians: Gaussians, views: Sequence[View], photos: Sequence[TrainingView], progress: Progress = QUIET
+    views: Sequence[View], photos: Sequence[TrainingView], looks: Sequence[Look], progress: Progress = QUIET
 ) -> list[StereoView | None]:
     """Depth of every photo, by a sensor or by stereo among the visit's photos; None where the map shows nothing.
 
-    The map's depth only bounds the search, so that a thing that is gone is not found again.
+    The map's depth bounds the search, so that a thing that is gone is not found again. Where the photo has another
+    colour than the map, the search does not prefer that depth: something else may stand there.
     """
     made: list[StereoView | None] = []
-    for view, photo in zip(views, photos, strict=True):
-        small = compared(photo)
-        out = render(gaussians, small.camera_from_world, small.K, *small.photo.shape[1::-1], eps2d=small.eps2d)
-        prior = expected_depth(out).numpy()
-        if small.depth is not None:
-            prior = np.where(small.depth.numpy() > 0, small.depth.numpy(), prior)
-        made.append(make_stereo_view(view, photo.photo.numpy(), prior))
+    for view, photo, shown in zip(views, photos, looks, strict=True):
+        prior = shown.mapped
+        if shown.view.depth is not None:
+            prior = np.where(shown.view.depth.numpy() > 0, shown.view.depth.numpy(), prior)
+        stereo = make_stereo_view(view, photo.photo.numpy(), prior)
+        if stereo is not None:
+            unlike = cv2.dilate((shown.colour > DIFFERENT).astype(np.uint8), np.ones((3, 3)))
+            unlike = cv2.resize(unlike, stereo.prior.shape[::-1], interpolation=cv2.INTER_NEAREST)
+            stereo.preferred = np.where(unlike > 0, np.float32(0), stereo.prior)
+        made.append(stereo)
     measure_depths([view for view in made if view is not None], progress)
     return made
 

@@ -91,11 +91,12 @@ def open_visit(run: Run, gmap: Map, source: MaskSource, output: Path) -> Visit:
         lit = in_light(old, light)
         shown = [look(lit, ids, compared(v), np.zeros(compared(v).photo.shape[:2])) for v in photos.views]
         foreign = foreign_photos(run.source, gmap, shown)
+        shown = [each for each, view in zip(shown, photos.training, strict=True) if view.name not in foreign]
         photos = _without(photos, foreign)
         for name in foreign:
             run.progress.log(f"left out: {name} (does not show what the map holds there)")
         run.progress.log(f"{len(photos.views)} photos of the visit; light {', '.join(f'{x:.2f}' for x in light)}")
-        stereo = stereo_of(old, photos.training, photos.views, run.progress)
+        stereo = stereo_of(photos.training, photos.views, shown, run.progress)
     depths = {view.name: each for view, each in zip(photos.training, stereo, strict=True)}
     photos, masks = label_photos(
         run, photos, source, lambda view: depth_at(depths[view.name], view.photo.shape, confirmed=False)

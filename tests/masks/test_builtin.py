@@ -142,7 +142,7 @@ def test_measured_depth_is_confirmed_without_stereo(monkeypatch):
 def bare_view(pose: np.ndarray) -> StereoView:
     """A camera without a photo."""
     none = np.zeros((120, 160), np.float32)
-    return StereoView("", none, none, K, pose, none, none, none > 0)
+    return StereoView("", none, none, K, pose, none, none, none, none > 0)
 
 
 def test_homography_carries_points_of_its_plane():

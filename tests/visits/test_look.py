@@ -1,0 +1,63 @@
+"""What stereo among a visit's photos finds where something new stands, against the exact depth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from perception.gaussians.views import TrainingView
+from perception.types import View
+from perception.visits.look import Look, depth_at, moments, stereo_of
+
+H, W = 120, 160
+K = np.array([[150.0, 0, W / 2], [0, 150.0, H / 2], [0, 0, 1]])
+WALL, BOX = 2.0, 1.6
+
+
+def texture(rng: np.random.Generator, strength: float) -> np.ndarray:
+    """[400, 400] smooth brightness around one half."""
+    import cv2
+
+    noise = cv2.GaussianBlur(rng.normal(size=(400, 400)), (0, 0), 2.0)
+    return 0.5 + strength * noise / noise.std()
+
+
+def plane(brightness: np.ndarray, depth: float, x: float) -> np.ndarray:
+    """[H, W] brightness of a plane at `depth` from a camera at x; 100 texels a metre."""
+    v, u = np.mgrid[:H, :W] + 0.5
+    columns = 100 * ((u - K[0, 2]) / K[0, 0] * depth + x) + 200
+    rows = 100 * (v - K[1, 2]) / K[1, 1] * depth + 200
+    return brightness[np.rint(rows).astype(int) % 400, np.rint(columns).astype(int) % 400]
+
+
+def shot(name: str, x: float, wall: np.ndarray, box: np.ndarray) -> tuple[View, TrainingView, Look, np.ndarray]:
+    """A photo of a plain box before a wall, beside a map of the wall alone; and the exact depth."""
+    u = np.arange(W) + 0.5
+    hit = np.abs((u - K[0, 2]) / K[0, 0] * BOX + x) < 0.25
+    hit = hit[None] & (np.abs(np.arange(H) + 0.5 - H / 2)[:, None] < 30)
+    old, new = plane(wall, WALL, x), plane(box, BOX, x)
+    image, photo = (np.repeat(a[..., None], 3, axis=2).astype(np.float32) for a in (old, np.where(hit, new, old)))
+    pose = np.eye(4)
+    pose[0, 3] = -x
+    bytes_ = np.clip(255 * photo, 0, 255).astype(np.uint8)
+    view = View(name, Path(name), K, W, H, pose)
+    camera = (torch.from_numpy(a.astype(np.float32)) for a in (K, pose))
+    training = TrainingView(name, torch.from_numpy(bytes_), None, *camera)
+    none, ids = np.zeros((H, W), np.float32), np.full((H, W), -1)
+    mapped = np.full((H, W), WALL, np.float32)
+    shown = Look(training, mapped, none, ids, *moments(image, photo), np.abs(image - photo).mean(axis=2))
+    return view, training, shown, np.where(hit, BOX, WALL)
+
+
+def test_a_plain_new_thing_is_not_drawn_to_the_surface_behind_it() -> None:
+    rng = np.random.default_rng(0)
+    wall, box = texture(rng, 0.12), texture(rng, 0.01) + 0.3
+    shots = [shot(f"{n}.jpg", x, wall, box) for n, x in enumerate(np.linspace(-0.4, 0.4, 5))]
+    views, photos, looks, exact = zip(*shots, strict=True)
+    found = stereo_of(views, photos, looks)
+    for stereo, depth in zip(found, exact, strict=True):
+        assert stereo is not None
+        off = np.abs(depth_at(stereo, (H, W), confirmed=False) / depth - 1) < 0.03
+        assert off[depth == BOX].mean() > 0.9 and off[depth == WALL].mean() > 0.95
