@@ -109,8 +109,9 @@ def sweep(view: StereoView, others: list[StereoView]) -> np.ndarray:
     """[h, w] float32 depth of `view` from its neighbours `others`, dense.
 
     The matching cost of a pixel at a plane is (1 − mean of its two best correlations over 7×7 pixels) / 2, plus a cost
-    per plane of distance from the preferred depth. Semi-global aggregation (Hirschmüller 2008, eq. 13) sums the costs of
-    paths from the left, the right, above and below; steps to distant planes cost less where the photo has a gradient.
+    per plane of distance from the preferred depth. Semi-global aggregation (Hirschmüller 2008, eq. 13) sums the costs
+    of paths from the left, the right, above and below; steps to distant planes cost less where the photo has a
+    gradient.
     """
     inverse = plane_depths(view.prior)
     depth = np.empty_like(view.prior)
