@@ -25,9 +25,8 @@ def timed(seconds: dict[str, float], part: str) -> Iterator[None]:
 class Progress:
     """Displays the progress of stages. quiet: no output, for use as a library."""
 
-    def __init__(self, quiet: bool = False, stream: Any = None):
-        self.stream = stream or sys.stderr
-        self.quiet = quiet
+    def __init__(self, quiet: bool = False):
+        self.stream, self.quiet = sys.stderr, quiet
         self.terminal = not quiet and hasattr(self.stream, "isatty") and self.stream.isatty()
         self._bar: Any = None
         self._last = 0.0

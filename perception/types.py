@@ -83,6 +83,9 @@ class Scene:
     report: dict[str, Any] = field(default_factory=dict)
 
 
+_UNIT_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+
+
 @dataclass(frozen=True)
 class OrientedBox:
     """center [3], rotation [3, 3] (rows are the box axes in the map frame), extent [3] full side lengths."""
@@ -90,6 +93,11 @@ class OrientedBox:
     center: np.ndarray
     rotation: np.ndarray
     extent: np.ndarray
+
+    @property
+    def corners(self) -> np.ndarray:
+        """[8, 3], by the bits of their number: 4 is the far side of the first axis, 1 that of the last."""
+        return self.center + (_UNIT_CORNERS * self.extent) @ self.rotation
 
     def to_json(self) -> dict[str, Any]:
         return {

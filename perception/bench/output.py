@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from perception.io.atomic import atomic_file
+from perception.io.atomic import write_file
 
 Column = tuple[str, str, str]
 """(column header, key in the row, format specification)."""
@@ -60,9 +60,7 @@ def finish(name: str, options: argparse.Namespace, report: dict[str, Any], text:
     from perception.tasks.folder import versions
 
     facts = {"bench": name, "arguments": dict(vars(options)), "machine": machine(), "versions": versions(), **report}
-    with atomic_file(options.output / f"{name}.json", parents=True) as aside:
-        aside.write_text(json.dumps(facts, indent=1, default=str), encoding="utf-8")
-    with atomic_file(options.output / f"{name}.txt") as aside:
-        aside.write_text(text + "\n", encoding="utf-8")
+    write_file(options.output / f"{name}.json", json.dumps(facts, indent=1, default=str), parents=True)
+    write_file(options.output / f"{name}.txt", text + "\n")
     print(json.dumps(facts, default=str) if options.json else text)
     print(f"kept in {options.output}: {name}.json, {name}.txt", file=sys.stderr)

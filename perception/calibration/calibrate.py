@@ -15,7 +15,7 @@ import numpy as np
 from perception.calibration.board import Board, Detection
 from perception.calibration.solve import NAMES, Solution, solve
 from perception.errors import InputError
-from perception.io.atomic import atomic_file
+from perception.io.atomic import write_file
 from perception.map.outputs import check_side_file, refuse_inputs
 from perception.photos.camera_file import camera_data, write_camera
 from perception.photos.decode import SUFFIXES, read_grey
@@ -64,8 +64,7 @@ def run_calibration(source: Path, output: Path, board: Board, model: str = "auto
     fx, fy, cx, cy, *distortion = solution.values.tolist()
     K, kind = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], result["distortion_model"]
     write_camera(output, camera_data(output.stem, solution.size, kind, K, distortion))
-    with atomic_file(report) as aside:
-        aside.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    write_file(report, json.dumps(result, indent=1) + "\n")
     result["camera"] = str(output)
     return result, _table(result)
 

@@ -17,7 +17,7 @@ from perception.cli.parser import Parser
 from perception.errors import InputError
 from perception.machine import limit_threads
 
-_MODULES = ("mapping", "maps", "localise", "scoring", "serving", "models")
+_MODULES = ("mapping", "maps", "scoring", "serving", "models")
 """Files of this package that add subcommands, in the order of --help."""
 
 

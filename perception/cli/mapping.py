@@ -11,6 +11,7 @@ from typing import Any
 from perception.cli.parser import command, map_command
 from perception.errors import InputError
 from perception.interrupts import handled
+from perception.progress import Progress
 
 
 def register(commands: Any) -> None:
@@ -131,7 +132,6 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
     config = load_config(args.config, settings_given(args), args.preset)
     from perception.pipeline.mapping import build_map
-    from perception.progress import Progress
     from perception.report.page import write_own_report
     from perception.report.text import map_facts
     from perception.tasks.engine import Engine
@@ -145,7 +145,6 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 def _update(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.map.outputs import refuse_inputs
-    from perception.progress import Progress
     from perception.report.page import write_own_report
     from perception.report.text import map_facts
     from perception.visits.scene import update_settings
@@ -161,7 +160,6 @@ def _update(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 def _fleet(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.pipeline.fleet import run_fleet
-    from perception.progress import Progress
     from perception.tasks.engine import Engine
 
     with _sigterm_as_interrupt(), Progress() as progress:
@@ -208,7 +206,6 @@ def _report(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 def _demo(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.pipeline.demo import run_demo
-    from perception.progress import Progress
 
     with _sigterm_as_interrupt(), Progress() as progress:
         return run_demo(args.output, progress)

@@ -1,14 +1,16 @@
 """What users ask of a finished map: `perception query`, `changes`, `index`, `export`, `render`, `label`, `relink`,
-`upgrade`, `scale`."""
+`upgrade`, `scale`, `localise`."""
 
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
 from typing import Any
 
 from perception.cli.parser import command, map_command
 from perception.errors import InputError
+from perception.progress import Progress
 
 
 def register(commands: Any) -> None:
@@ -76,6 +78,13 @@ def register(commands: Any) -> None:
     )
     p.add_argument("--tag-size", metavar="M", help="side of the AprilTags or ArUco markers in the photos")
     p.add_argument("--board", metavar="TEXT", help="a calibration board in the photos, such as charuco:8x11:0.02")
+    p = map_command(commands, "localise", _localise, "poses of new photos in the map's frame, with standard error")
+    p.add_argument("new", type=Path, nargs="+", metavar="PHOTOS", help="photos, or what `map` takes: poses are ignored")
+    p.add_argument("-o", "--output", type=Path, metavar="transforms.json", help="the poses, as nerfstudio reads them")
+    p.add_argument(
+        "--photos", type=Path, metavar="DIR", help="where the map's photos lie, if not where it records them"
+    )
+    p.add_argument("--camera", type=Path, metavar="FILE.yaml", help="intrinsics of the new photos, ROS camera_info")
 
 
 def _query(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
@@ -110,7 +119,6 @@ def _changes(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _index(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.progress import Progress
     from perception.query.indexing import index_maps
 
     if not args.maps and not args.remove:
@@ -164,7 +172,6 @@ def _relink(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 def _upgrade(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.edit.upgrade import upgrade_map
-    from perception.progress import Progress
 
     facts = upgrade_map(args.map, args.output, progress=Progress(quiet=args.json))
     before, after = facts["encoder"]
@@ -231,3 +238,16 @@ def _render(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.export.render import render_map
 
     return render_map(args.map, args.output, args.cameras, args.what.split(","))
+
+
+def _localise(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.localise.report import localise_photos
+
+    with Progress(quiet=args.json) as progress:
+        facts, lines = localise_photos(args.map, args.new, args.output, args.photos, args.camera, progress)
+    if not any(photo["localised"] for photo in facts["photos"]):
+        if args.json:
+            print(json.dumps(facts, allow_nan=False))
+        first = facts["photos"][0]
+        raise InputError(f"{args.map}: none of {len(facts['photos'])} photos: {first['name']}: {first['why']}")
+    return facts, "\n".join(lines)

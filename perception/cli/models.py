@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from perception.cli.parser import Parser, command
+from perception.progress import Progress
 
 
 def register(commands: Any) -> None:
@@ -56,7 +57,6 @@ def _check(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 def _get(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.models import get_model
     from perception.onnx.store import catalogue
-    from perception.progress import Progress
 
     if args.name is not None:
         return _described(get_model(args.name, Progress()))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from perception.cli.parser import map_command
+from perception.progress import Progress
 
 
 def register(commands: Any) -> None:
@@ -89,7 +90,6 @@ def _node(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
             values[name] = getattr(args, name)
     config = node_config(values)
     from perception.node.ros import serve_node, stop_on_signals
-    from perception.progress import Progress
 
     with stop_on_signals() as stop:
         figures = serve_node(args.map, config, stop, Progress().log)

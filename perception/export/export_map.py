@@ -20,7 +20,7 @@ from perception.export.smooth import read_segments, segment_cloud, vote
 from perception.export.spz import write_spz
 from perception.frame.recentre import map_from_input
 from perception.geometry import check_similarity, move_points, scale_of
-from perception.io.atomic import atomic_file
+from perception.io.atomic import write_file
 from perception.io.cloud import read_cloud, storable, write_cloud
 from perception.io.documents import refusing
 from perception.map.write import Map, read_map
@@ -299,8 +299,7 @@ def write_export(
         row = {"score": float(known.get("score", 1.0)), "label": known.get("label"), "num_points": n}
         rows[str(i)] = row | {key: known[key] for key in ("parent", "instances", *_RECORD) if key in known}
     sidecar = {**(facts or {}), "instances": rows}
-    with atomic_file(path.with_suffix(".json")) as new:
-        new.write_text(json.dumps(sidecar, indent=1), encoding="utf-8")
+    write_file(path.with_suffix(".json"), json.dumps(sidecar, indent=1))
     labelled = {"instance_id": labels.astype(np.int32)}
     write_cloud(path, replace(cloud, labels=labelled | {n: v for n, v in cloud.labels.items() if n not in labelled}))
     return sidecar

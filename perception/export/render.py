@@ -18,7 +18,7 @@ from perception.gaussians.model import Gaussians, as_gaussians
 from perception.gaussians.views import depth_image, render, rgb_image
 from perception.inputs.transforms import in_map_frame, read_frames
 from perception.instances.silhouettes import render_silhouettes
-from perception.io.atomic import atomic_file
+from perception.io.atomic import write_file
 from perception.io.documents import refusing, safe_name
 from perception.map.outputs import refuse_inputs
 from perception.map.write import Map, read_map
@@ -143,5 +143,4 @@ def write_picture(path: Path, image: np.ndarray) -> None:
     """Writes an image [H, W] or [H, W, 3] RGB; folders are made. InputError when that fails."""
     if image.ndim == 3:
         image = np.ascontiguousarray(image[..., ::-1])
-    with atomic_file(path, parents=True) as aside:
-        aside.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+    write_file(path, cv2.imencode(".png", image)[1].tobytes(), parents=True)

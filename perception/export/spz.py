@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.atomic import atomic_file
+from perception.io.atomic import atomic_file, write_file
 from perception.map.map import Map
 from perception.splats.spz import COLOR_SCALE, FLIPS, HEADER, MAGIC
 
@@ -33,8 +33,7 @@ def write_spz(path: Path, gmap: Map) -> None:
     data = spz_bytes(gmap, path)
     with atomic_file(path.with_suffix(".npy")) as new, new.open("wb") as file:
         np.save(file, gmap.instance_ids.astype(np.int32))
-    with atomic_file(path) as new:
-        new.write_bytes(data)
+    write_file(path, data)
 
 
 def spz_bytes(gmap: Map, path: Path = Path("map.spz")) -> bytes:

@@ -10,11 +10,10 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.inputs.colmap_files import Model, names_in, read_model
-from perception.inputs.far import without_far
 from perception.io.documents import safe_name
 from perception.photos.folder import folders_below, list_photos
 from perception.photos.named_files import NamedFiles, parts_of
-from perception.photos.views import first_of
+from perception.photos.views import first_of, without_far
 from perception.sfm.model import cloud_of, views_of_model
 from perception.sfm.options import ReadOptions
 from perception.sfm.triangulate import MIN_POINTS, posed_scene

@@ -11,13 +11,12 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.geometry import inverse_se3
-from perception.inputs.far import without_far
 from perception.io.documents import safe_name
 from perception.photos.decode import read_picture
 from perception.photos.depth import read_depth
 from perception.photos.ignore_masks import mask_of
 from perception.photos.video import MOST_FRAMES, Chooser
-from perception.photos.views import first_of, posed_view, rigid_pose
+from perception.photos.views import first_of, posed_view, rigid_pose, without_far
 from perception.progress import Progress
 from perception.sfm.options import NO_CLOUD, ReadOptions
 from perception.sfm.triangulate import posed_scene

@@ -14,7 +14,6 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
-from perception.inputs.far import without_far
 from perception.inputs.start_cloud import start_points
 from perception.io.documents import brief, read_json, refusing, safe_name
 from perception.photos.decode import SUFFIXES, photo_size, why_left_out
@@ -22,7 +21,7 @@ from perception.photos.ignore_masks import mask_of
 from perception.photos.lens import FISHEYE, PERSPECTIVE, camera_from_lens, opencv_lens
 from perception.photos.named_files import NamedFiles
 from perception.photos.view_json import absolute
-from perception.photos.views import first_of, posed_view, rigid_pose
+from perception.photos.views import first_of, posed_view, rigid_pose, without_far
 from perception.sfm.options import NO_CLOUD, ReadOptions
 from perception.sfm.triangulate import posed_scene
 from perception.types import DepthImage, Lens, Scene, View

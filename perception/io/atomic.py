@@ -46,6 +46,12 @@ def atomic_file(path: str | Path, parents: bool = False) -> Iterator[Path]:
         yield temporary
 
 
+def write_file(path: str | Path, content: str | bytes, parents: bool = False) -> None:
+    """Writes a whole file as `atomic_file` does, a text in UTF-8."""
+    with atomic_file(path, parents) as new:
+        new.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
+
+
 @contextmanager
 def atomic_directory(path: Path, fresh: bool = False) -> Iterator[Path]:
     """Yields an empty temporary sibling folder to fill; on success it replaces `path` by `swap`, else it is removed.

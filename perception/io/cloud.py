@@ -185,11 +185,8 @@ def _triangles(faces: np.ndarray | Lists, vertices: int, path: Path) -> np.ndarr
 
 def _fans(faces: Lists) -> np.ndarray:
     """`_triangles` of faces of different numbers of corners."""
-    found, at, corner = (
-        np.empty((int(np.maximum(faces.counts, 2).sum(dtype=np.int64)) - 2 * len(faces), 3), np.int32),
-        0,
-        0,
-    )
+    total = int(np.maximum(faces.counts, 2).sum(dtype=np.int64)) - 2 * len(faces)
+    found, at, corner = np.empty((total, 3), np.int32), 0, 0
     for begin in range(0, len(faces), _SOME):
         counts = faces.counts[begin : begin + _SOME].astype(np.int64)
         n = np.maximum(counts - 2, 0)

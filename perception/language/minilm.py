@@ -64,9 +64,8 @@ class MiniLM:
         """Token ids [B, T] → mean of the last hidden states over the tokens [B, 384]."""
         w, (count, length) = self._weights, ids.shape
         x = w["embeddings.word_embeddings.weight"][ids] + w["embeddings.position_embeddings.weight"][:length]
-        x = self._norm(x + w["embeddings.token_type_embeddings.weight"][0], "embeddings.LayerNorm").reshape(
-            -1, self.dim
-        )
+        x = self._norm(x + w["embeddings.token_type_embeddings.weight"][0], "embeddings.LayerNorm")
+        x = x.reshape(-1, self.dim)
         for n in range(self._config["num_hidden_layers"]):
             at = f"encoder.layer.{n}"
             parts = (self._linear(x, f"{at}.attention.self.{part}") for part in ("query", "key", "value"))

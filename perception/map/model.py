@@ -106,9 +106,8 @@ def check_instances(value: Any, facts: dict[str, Any]) -> None:
     check(INSTANCES, value)
     entries, seen, visits = value["instances"], set(), len(facts.get("visits") or [0])
     for n, instance in enumerate(entries):
-        check(
-            INSTANCE, instance, f"instances[{n}]"
-        )  # each alone: what is checked is copied, and 20,000 copies cost time
+        # Each alone: what is checked is copied, and 20,000 copies cost time.
+        check(INSTANCE, instance, f"instances[{n}]")
         check_record(instance, visits)
         for entry in (instance, *instance.get("parts", ())):
             if entry["id"] in seen:

@@ -41,9 +41,8 @@ def _replace(new: Path, path: Path) -> Path | None:
             raise InputError(f"{path}: is no map, and a map replaces nothing else; choose another path")
         _link(path, new, own_files(path) or ())
     old = swap(new, path)
-    for folder in (
-        _folders(old) if old == new else ()
-    ):  # the new map gets the user's folders, the old one those of links
+    # The new map gets the user's folders, the old one those of links.
+    for folder in _folders(old) if old == new else ():
         with contextlib.suppress(OSError):
             exchange(folder, path / folder.name)
     return old

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.atomic import atomic_file
+from perception.io.atomic import write_file
 from perception.io.documents import brief, read_yaml
 from perception.photos.lens import FISHEYE, MOST_SIDE, PERSPECTIVE, opencv_lens
 from perception.types import Lens
@@ -91,9 +91,7 @@ def write_camera(path: Path, data: dict[str, Any]) -> None:
     """Writes a camera_info as YAML."""
     import yaml
 
-    text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None)
-    with atomic_file(path) as new:
-        new.write_text(text, encoding="utf-8")
+    write_file(path, yaml.safe_dump(data, sort_keys=False, default_flow_style=None))
 
 
 def _data(data: dict[str, Any], key: str) -> Any:

@@ -111,10 +111,8 @@ def resized(a: tuple[int, int], b: tuple[int, int]) -> bool:
     """Whether a photo of size b (width, height) may be one of size a, resized: by one ratio, to less than a pixel of
     the smaller one, as programs round up or down."""
     (small_w, small_h), (large_w, large_h) = sorted((a, b))
-    low, high = (
-        max((small_w - 1) / large_w, (small_h - 1) / large_h),
-        min((small_w + 1) / large_w, (small_h + 1) / large_h),
-    )
+    low = max((small_w - 1) / large_w, (small_h - 1) / large_h)
+    high = min((small_w + 1) / large_w, (small_h + 1) / large_h)
     return low < high and small_h <= large_h
 
 

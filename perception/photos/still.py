@@ -18,7 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from perception.io.atomic import atomic_file
+from perception.io.atomic import write_file
 from perception.photos.decode import decode, nearest, open_photo, reduced_size, to_rgb, upright
 from perception.photos.ignore_masks import read_mask
 from perception.progress import Progress
@@ -126,8 +126,7 @@ def _written(folder: Path, used: np.ndarray, own: Path | None, size: tuple[int, 
     path = folder / f"{hashlib.sha256(data).hexdigest()[:16]}.png"
     if not path.is_file():  # its time of change is part of what features are kept by
         folder.mkdir(parents=True, exist_ok=True)
-        with atomic_file(path) as aside:
-            aside.write_bytes(data)
+        write_file(path, data)
     return path
 
 

@@ -14,7 +14,7 @@ from typing import Any
 from perception.config import MapConfig
 from perception.errors import InputError
 from perception.inputs.load import input_files
-from perception.io.atomic import atomic_file
+from perception.io.atomic import write_file
 from perception.io.documents import read_json, refusing
 from perception.masks.sam_models import sam_graphs
 from perception.onnx.sessions import side_files
@@ -105,8 +105,7 @@ def hold_inputs(work: Path, source: Path, config: MapConfig, output: Path) -> In
         raise InputError(f"{file}: is damaged; {todo}")
     both = before.keys() & now.keys()
     _compare(work, {key: before[key] for key in both}, {key: now[key] for key in both}, "since this run began", todo)
-    with atomic_file(file) as aside:
-        aside.write_text(json.dumps({**before, **now}), encoding="utf-8")
+    write_file(file, json.dumps({**before, **now}))
     return now
 
 

@@ -9,7 +9,7 @@ from scipy import ndimage
 from perception.geometry import move_points
 from perception.map.map import Map
 from perception.query.floor_grid import FREE, HEIGHT, STEP, UNKNOWN, level_surface
-from perception.query.spatial_index import CORNERS
+from perception.types import OrientedBox
 
 CELL = 0.05  # side of a cell of the floor and of a voxel, metres
 CLEARANCE = 0.1  # end of a ray in which nothing blocks it, metres: what touches the instance does not hide it
@@ -67,8 +67,8 @@ class FreeSpace:
 
     def _footprint(self, box: dict[str, list[float]]) -> np.ndarray:
         """bool [H, W]: cells below the box, of instances.json, if a robot under it would be in it."""
-        corners = np.array(box["center"]) + CORNERS * np.array(box["extent"]) @ np.array(box["rotation"])
-        corners, mask = move_points(np.linalg.inv(self.map_from_grid), corners), np.zeros(self._free.shape, np.uint8)
+        corners = move_points(np.linalg.inv(self.map_from_grid), OrientedBox.from_json(box).corners)
+        mask = np.zeros(self._free.shape, np.uint8)
         if corners[:, 2].min() < HEIGHT and corners[:, 2].max() > STEP:
             cells = np.floor(corners[:, :2] / CELL).astype(np.int32)
             cv2.fillConvexPoly(mask, cv2.convexHull(cells), 1)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.atomic import atomic_file, pointed, recover
+from perception.io.atomic import atomic_file, pointed, recover, write_file
 from perception.language.encoders import make_encoder
 from perception.map.checksums import FACTS, STORE
 from perception.map.replace import writing
@@ -73,8 +73,7 @@ def index_maps(
         if not entries:
             raise InputError(f"{store}: would hold no map; give maps, or delete it")
         facts["maps"] = [entries[path] for path in sorted(entries)]
-        with atomic_file(store / STORE) as aside:
-            aside.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+        write_file(store / STORE, json.dumps(facts, indent=1) + "\n")
         listed = {entry["file"] for entry in facts["maps"]}
         for file in (store / "maps").iterdir():  # of other maps, and of writers that were killed
             if file.name not in listed and _is_ours(file):

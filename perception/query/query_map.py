@@ -248,11 +248,9 @@ class QueryMap(Map):
     @cached_property
     def last_known(self) -> QueryMap:
         """This map, and every instance that it does not have any more where it stood last."""
-        return (
-            self
-            if not self._left
-            else self._scene(self._visit, lambda entry: stood(entry, self._visit) or left(entry, self._visit))
-        )
+        if not self._left:
+            return self
+        return self._scene(self._visit, lambda entry: stood(entry, self._visit) or left(entry, self._visit))
 
     def _scene(self, visit: int, spot_of: Callable[[Spot], Spot | None]) -> QueryMap:
         fields = scene(self.record, spot_of)

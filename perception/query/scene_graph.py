@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from perception.errors import InputError
-from perception.io.atomic import atomic_file
+from perception.io.atomic import write_file
 from perception.query.relations import LevelBoxes, level_from_map
 
 if TYPE_CHECKING:
@@ -226,8 +226,7 @@ def write_graph(gmap: Map, path: Path) -> tuple[dict[str, Any], str]:
     import networkx
 
     graph = scene_graph(gmap)
-    with atomic_file(path, parents=True) as aside:
-        aside.write_text(json.dumps(networkx.node_link_data(graph, edges="edges"), indent=1), encoding="utf-8")
+    write_file(path, json.dumps(networkx.node_link_data(graph, edges="edges"), indent=1), parents=True)
     kinds = Counter(kind for _, kind in graph.nodes(data="kind"))
     relations = Counter(relation for _, _, relation in graph.edges(data="relation"))
     counts = ", ".join(f"{count} {name}" for name, count in (*sorted(kinds.items()), *sorted(relations.items())))

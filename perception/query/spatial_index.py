@@ -11,7 +11,6 @@ from perception.map.map import InstanceIndex
 from perception.query.where import inside
 from perception.types import OrientedBox
 
-CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _NEIGHBORS = 8
 
 
@@ -42,7 +41,7 @@ class SpatialIndex:
 
     def share_inside(self, instance_id: int, region: OrientedBox) -> float:
         """The share of the instance's points that lies in `region`, in [0, 1]; 0 without points."""
-        points, corners = self.index.of(instance_id), region.center + (CORNERS * region.extent) @ region.rotation
+        points, corners = self.index.of(instance_id), region.corners
         low, high = self.aabb(instance_id)
         apart = (corners.max(axis=0) < low - 1e-9).any() or (corners.min(axis=0) > high + 1e-9).any()
         return float(inside(region, points).mean()) if len(points) and not apart else 0.0

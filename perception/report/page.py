@@ -20,22 +20,22 @@ from perception.colors import instance_palette
 from perception.config import flat
 from perception.errors import InputError
 from perception.gaussians.model import as_gaussians
+from perception.gaussians.photos import training_view
 from perception.gaussians.views import TrainingView, render, render_view
 from perception.instances.crops import expand_box, mask_box
 from perception.instances.silhouettes import render_silhouettes
-from perception.io.atomic import atomic_file
+from perception.io.atomic import write_file
 from perception.map.files import read_info
 from perception.map.history import stood
 from perception.map.map import MAX_SIDE, Map
 from perception.map.write import REPORT
-from perception.photos.decode import load_photo, scaled_K
 from perception.pictures import error_map, features_to_rgb, outline, overlay, titled_row
 from perception.progress import Progress
 from perception.query import QueryMap, load_map
 from perception.query.crops import cut_out
 from perception.query.hit import printed_texts
-from perception.query.spatial_index import CORNERS
 from perception.report.text import changes_parts, depth_figures, guessed_names
+from perception.types import OrientedBox
 
 SHOWN = ("worst", "middle", "best")
 """Held-out views shown beside their photos, by PSNR."""
@@ -92,8 +92,7 @@ def write_page(path: Path, data: Mapping[str, Any]) -> Path:
         page = text.encode(errors="replace")  # an unpaired surrogate in a file name cannot be encoded as UTF-8
         if len(page) < LIMIT:
             break
-    with atomic_file(path, parents=True) as aside:
-        aside.write_bytes(page)
+    write_file(path, page, parents=True)
     return path
 
 
@@ -159,14 +158,19 @@ class _Album:
         self.views = {view.name: view for view in gmap.views}
         figures = gmap.info.get("quality", {}).get("views", {})
         self.scored = {name: own for name, own in figures.items() if name in self.views and None not in own.values()}
-        self.photo, self.ids = cache(self._photo), cache(self._ids)
+        self.trained, self.ids = cache(self._trained), cache(self._ids)
 
-    def _photo(self, name: str) -> np.ndarray | None:
-        """[h, w, 3] uint8; None when it can no longer be read, or is none of the map's."""
+    def _trained(self, name: str) -> TrainingView | None:
+        """The view as it was trained; None when its photo can no longer be read, or is none of the map's."""
         try:
-            return load_photo(self.gmap.with_photo(self.views[name]), self.side)
+            return training_view(self.gmap.with_photo(self.views[name]), self.side)
         except (InputError, KeyError):
             return None
+
+    def photo(self, name: str) -> np.ndarray | None:
+        """[h, w, 3] uint8; None without one."""
+        view = self.trained(name)
+        return None if view is None else view.photo.numpy()
 
     def visit(self, name: str) -> int:
         """The number of the visit that took a view's photo; 0 for a name that is none of the map's."""
@@ -174,18 +178,15 @@ class _Album:
 
     def _camera(self, name: str) -> tuple[torch.Tensor, torch.Tensor, int, int]:
         """camera_from_world [4, 4], K [3, 3], width and height of a view's photo as it was trained."""
-        view, photo = self.views[name], self.photo(name)
-        assert photo is not None  # see the class
-        height, width = photo.shape[:2]
-        pose, K = (array.astype(np.float32) for array in (view.camera_from_world, scaled_K(view, width, height)))
-        return torch.from_numpy(pose), torch.from_numpy(K), width, height
+        view = self.trained(name)
+        assert view is not None  # see the class
+        height, width = view.photo.shape[:2]
+        return view.camera_from_world, view.K, width, height
 
     def render(self, name: str) -> np.ndarray:
         """[h, w, 3] uint8: the map rendered from the camera of the photo."""
-        pose, K, _, _ = self._camera(name)
-        gain = self.views[name].gain
-        exposure = None if gain is None else torch.tensor(gain)
-        view = TrainingView(name, torch.from_numpy(self.photo(name)), None, K, pose, gain=exposure)
+        view = self.trained(name)
+        assert view is not None  # see the class
         return (render_view(self.gaussians, view) * 255 + 0.5).to(torch.uint8).numpy()
 
     def _ids(self, name: str) -> np.ndarray:
@@ -195,8 +196,7 @@ class _Album:
     def spot(self, box: dict[str, Any], first: int, last: int) -> np.ndarray | None:
         """The photo of the visits `first` to `last` that shows most of the box, as in instances.json, cut out with a
         margin; None when none shows half of it."""
-        corners = np.array(box["center"]) + CORNERS * np.array(box["extent"]) @ np.array(box["rotation"])
-        boxes = []
+        corners, boxes = OrientedBox.from_json(box).corners, []
         for name, view in self.views.items():
             x, y, depth = view.camera_from_world[:3, :3] @ corners.T + view.camera_from_world[:3, 3:]
             if first <= self.visit(name) <= last and depth.min() > 0:

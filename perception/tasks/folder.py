@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from perception.errors import InputError
-from perception.io.atomic import atomic_file
+from perception.io.atomic import write_file
 from perception.photos.scene_file import load_saved_scene, save_scene
 from perception.progress import Progress
 from perception.tasks.engine import Engine
@@ -24,8 +24,7 @@ def write_task(folder: Path, scene: Scene | None = None, **facts: Any) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     if scene is not None:
         save_scene(folder / SCENE, scene)
-    with atomic_file(folder / TASK) as aside:
-        aside.write_text(json.dumps({**facts, "versions": versions()}), encoding="utf-8")
+    write_file(folder / TASK, json.dumps({**facts, "versions": versions()}))
 
 
 def has_task(folder: Path) -> bool:

@@ -19,6 +19,7 @@ from perception.colors import instance_palette
 from perception.errors import InputError, missing_extra
 from perception.map.history import is_removed
 from perception.serve.listening import Guard, check_address, listen, url_host
+from perception.types import OrientedBox
 from perception.viewer.handshake import guarded_server
 from perception.viewer.levels import MOST, Level, level
 from perception.viewer.panel import Panel
@@ -30,8 +31,7 @@ WATCH = 1.0
 """Seconds between checks whether another program changed the map."""
 GHOST_SIZE = 0.02
 """Side of a point of what stood elsewhere, where the map has size 10."""
-CORNERS = np.array([[i >> a & 1 for a in range(3)] for i in range(8)]) - 0.5  # of a unit box
-EDGES = np.array([(i, i | 1 << a) for i in range(8) for a in range(3) if not i >> a & 1])
+EDGES = np.array([(i, i | 1 << a) for i in range(8) for a in range(3) if not i >> a & 1])  # of `OrientedBox.corners`
 
 
 class Viewer:
@@ -146,9 +146,8 @@ class Viewer:
         for entry in session.editor.instances if self._boxed else ():
             gone = is_removed(entry) and session.mode != "changes"
             if not entry.get("hidden") and not gone and (not lit or entry["id"] in lit):
-                box, number = entry["obb"], entry["id"]
-                points = np.array(box["center"]) + (CORNERS * box["extent"]) @ np.array(box["rotation"])
-                segments = (points[EDGES] * self.scale).astype(np.float32)
+                box, number = OrientedBox.from_json(entry["obb"]), entry["id"]
+                segments = (box.corners[EDGES] * self.scale).astype(np.float32)
                 style = {"thickness": 2, "thickness_units": "screen"}
                 changed = session.mode == "changes" and entry.get("state") in STATE_COLORS
                 name = session.name(entry) + (f", {entry['state']}" if changed else "")

@@ -15,9 +15,9 @@ from perception.errors import InputError
 from perception.frame.recentre import moved_scene, recentred
 from perception.gaussians.views import TrainingView, scene_extent
 from perception.geometry import camera_centres, far_from_most, inverse_se3
-from perception.inputs.far import without_far
 from perception.photos.decode import load_photo
 from perception.photos.scene_file import load_saved_scene, save_scene
+from perception.photos.views import without_far
 from perception.types import View
 from support.given_poses import (
     NAMES,
