@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 
 from perception.errors import InputError
-from perception.io.atomic import atomic_file
+from perception.io.atomic import write_file
 from perception.onnx.store import cache_folder
 
 MAX_FEATURES = 8  # channels that the kernels take at once; more go through in slices
@@ -119,8 +119,8 @@ def cached_kernels(options: KernelOptions, architecture: int) -> bytes:
     if file.is_file():
         return file.read_bytes()
     cubin, _ = compile_kernels(nvrtc, options, architecture)
-    with suppress(InputError), atomic_file(file, parents=True) as part:
-        part.write_bytes(cubin)  # where the folder cannot be written, it is compiled again next time
+    with suppress(InputError):  # where the folder cannot be written, it is compiled again next time
+        write_file(file, cubin, parents=True)
     return cubin
 
 
