@@ -49,7 +49,7 @@ FRAGMENT = 0.3, 3
 stands beside it, no thing; most things score .8 and more."""
 
 OUTLINED = 0.5
-"""Least IoU of a new thing with masks of the photos; things have .7 to .9."""
+"""Least IoU of a new thing with masks of the photos, relative to the median of those that stand where they stood."""
 
 
 @dataclass
@@ -104,7 +104,7 @@ def seen_today(visit: Visit) -> Today:
         made = _without_fragments(grouped(grown, votes, free, run.config), run.config.instances.min_cluster_size)
     things = [(free[made.ids == n], float(made.scores[n])) for n in range(made.count) if (made.ids == n).any()]
     with run.stage("evidence"):
-        old, ground = _shown_before(visit, before, grown, things, gone)
+        old, ground = _shown_before(visit, before, signs, grown, things, gone)
         made = replace(made, ids=np.where(np.isin(free, _rows(things, ground)), -1, made.ids))
         stands = [j for j in range(len(things)) if j not in ground]
         things, old = [things[j] for j in stands], {n for n, j in enumerate(stands) if j in old}
@@ -134,11 +134,16 @@ def _signs(visit: Visit, looks: list[Look]) -> list[Signs]:
 
 
 def _shown_before(
-    visit: Visit, before: list[Look], grown: Gaussians, things: list[tuple[np.ndarray, float]], gone: list[int]
+    visit: Visit,
+    before: list[Look],
+    known: list[Signs],
+    grown: Gaussians,
+    things: list[tuple[np.ndarray, float]],
+    gone: list[int],
 ) -> tuple[set[int], set[int]]:
     """Numbers of the things that the old map shows as the photos do, `before`: it only did not know them as things.
     A thing in front of one that is `gone`, or in its place, is none of these. Numbers of those that no photo shows, or
-    that have the outline of no mask: they are ground that was hidden until now."""
+    that have the outline of no mask: they are ground that was hidden until now. known: signs of the map's instances."""
     ids = np.full(len(grown), -1, np.int32)
     for j, (rows, _) in enumerate(things):
         ids[rows] = j
@@ -150,8 +155,10 @@ def _shown_before(
     anywhere = np.full(len(things), np.inf)  # what is in front of the old surface counts, too
     signs = signs_of(looks, range(len(things)), np.ones(len(things)), anywhere)
     fresh = instead > INSTEAD * pixels
-    known = {j for j, each in enumerate(signs) if each.photos and each.log_odds > 0 and not fresh[j]}
-    return known, {j for j, each in enumerate(signs) if not each.photos or each.outline < OUTLINED}
+    old = {j for j, each in enumerate(signs) if each.photos and each.log_odds > 0 and not fresh[j]}
+    usual = [each.outline for each in known if each.log_odds > 0 and np.isfinite(each.outline)]
+    least = OUTLINED * float(np.median(usual or 1.0))
+    return old, {j for j, each in enumerate(signs) if not each.photos or each.outline < least}
 
 
 def _moved(
