@@ -9,7 +9,6 @@ import torch
 
 from perception.gaussians.model import Gaussians, Nearby
 from perception.gaussians.state import TrainRecord
-from perception.geometry import move_points
 from perception.instances.group import Grouping
 from perception.instances.votes import mask_votes
 from perception.map.history import is_removed
@@ -35,20 +34,16 @@ from perception.visits.motion import (
     TWINS,
     Motion,
     assigned,
-    cuts_of,
-    judged,
     motions_of,
     settled,
 )
-from perception.visits.registration import Points, carried, looks_alike
+from perception.visits.registration import carried, looks_alike
 from perception.visits.visit import Visit, gaussians_of
 
 UP = (0.0, 0.0, 1.0)
 """Of a map that does not record gravity."""
 INSTEAD = 0.3
 """Share of a new thing's pixels where the old map showed things that are gone, from which it was not there before."""
-WITHIN = 1.5
-"""Radii of a thing within which the centre of a piece of it lies."""
 FRAGMENT = 0.3, 3
 """A new group of a score below, and of less than this many times the least Gaussians of a group, is a piece of what
 stands beside it, no thing; most things score .8 and more."""
@@ -197,35 +192,7 @@ def _moved(
         rivals = np.concatenate([np.delete(odds[:, j], a), np.delete(odds[a], j)])
         unsure = rivals.max(initial=-np.inf) > odds[a, j] - CLOSE
         pairs[gone[a]] = (j, replace(motions[a, j], ambiguous=motions[a, j].ambiguous or bool(unsure)))
-    return pairs | _pieces(visit, grown, things, {i: olds[i] for i in gone}, pairs)
-
-
-def _pieces(
-    visit: Visit,
-    grown: Gaussians,
-    things: list[tuple[np.ndarray, float]],
-    olds: dict[int, Gaussians],
-    pairs: dict[int, tuple[int, Motion]],
-) -> dict[int, tuple[int, Motion]]:
-    """As `pairs`, of the other instances that are gone, such as the legs of a chair, which stood within a thing that
-    moved, and of which the photos say that they moved with it."""
-    pieces, frames = dict[int, tuple[int, Motion]](), visit.frames
-    extents = {entry["id"]: min(entry["obb"]["extent"]) for entry in visit.gmap.instances}
-    for k, (j, motion) in pairs.items():
-        whole = Points.of(olds[k])
-        rest = grown.rows(torch.from_numpy(np.setdiff1d(np.arange(len(grown)), things[j][0])))
-        for i in sorted(olds.keys() - pairs.keys() - pieces.keys()):
-            piece = Points.of(olds[i])
-            if len(piece.points) == 0 or piece.radius > whole.radius:
-                continue
-            away = float(np.linalg.norm(piece.points.mean(axis=0) - whole.points.mean(axis=0)))
-            if away > WITHIN * whole.radius:
-                continue
-            cuts = cuts_of(frames, move_points(motion.new_from_old, piece.points), rest)
-            signs = judged(olds[i], [motion.new_from_old], cuts, extents[i])[0][0] if cuts else None
-            if signs is not None and signs.log_odds > MOVED:
-                pieces[i] = (j, replace(motion, odds=signs.log_odds))
-    return pieces
+    return pairs
 
 
 def _settled(

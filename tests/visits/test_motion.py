@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from itertools import permutations
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
 from perception.gaussians.model import Gaussians, isotropic
-from perception.gaussians.views import TrainingView, expected_depth, render
+from perception.gaussians.views import TrainingView, render
 from perception.instances.group import Grouping
-from perception.visits.motion import Cut, Motion, assigned, judged, refined
+from perception.visits.motion import Cut, assigned, judged, refined
 from perception.visits.registration import Points, angle_between, carried, compact, looks_round, register
-from perception.visits.today import _pieces, _without_fragments
+from perception.visits.today import _without_fragments
 from support.aimed import look_at
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -108,32 +106,6 @@ def test_a_motion_is_refined_to_the_one_that_the_photos_show() -> None:
     found = refined(gaussians, judged(gaussians, [start], cuts, 0.06)[0], cuts, 0.06, 0.1, 0.03)
     assert found[0].same > judged(gaussians, [start], cuts, 0.06)[0][0].same + 1
     assert angle_between(found[1], true) < 2 and np.linalg.norm((found[1] - true)[:3, 3]) < 0.003
-
-
-def test_a_piece_of_a_moved_thing_moves_with_it_unless_the_photos_show_it_gone() -> None:
-    """Photos are renders of the moved thing with one of its two pieces; the other one is nowhere."""
-    rng = np.random.default_rng(6)
-    generator = torch.Generator().manual_seed(2)
-
-    def block(middle: list[float], size: float) -> Gaussians:
-        colors = torch.rand(200, 3, generator=generator)
-        points = thing(rng, 200).points * size + middle
-        return isotropic(points, torch.full((200,), -4.6), colors, 0.9, 2, generator)
-
-    whole, leg, lost = block([0, 0, 0], 1), block([0.08, 0, -0.05], 0.4), block([-0.08, 0, -0.05], 0.4)
-    true = motion(40.0, (0.6, 0.05, 0.0))
-    grown = Gaussians.concatenate([carried(whole, true), carried(leg, true)])
-    K, frames = torch.tensor([[110.0, 0, 32], [0, 110, 32], [0, 0, 1]]), []
-    for eye in ((1.0, 0.1, 0.3), (0.3, 0.5, 0.3), (0.5, -0.5, 0.1)):
-        camera = torch.from_numpy(look_at(np.array(eye), true[:3, 3], UP).astype(np.float32))
-        out = render(grown, camera, K, 64, 64, harmonics=True)
-        photo = (out.colors[0].clamp(0, 1) * 255).to(torch.uint8)
-        frames.append((TrainingView("a", photo, None, K, camera), expected_depth(out).numpy()))
-    entries = [{"id": i, "obb": {"extent": [0.1, 0.1, 0.05]}} for i in range(3)]
-    visit: Any = SimpleNamespace(frames=frames, gmap=SimpleNamespace(instances=entries))
-    things = [(np.arange(len(grown)), 1.0)]
-    found = _pieces(visit, grown, things, {0: whole, 1: leg, 2: lost}, {0: (0, Motion(true, 9.0))})
-    assert list(found) == [1] and found[1][0] == 0 and np.array_equal(found[1][1].new_from_old, true)
 
 
 def test_round_things_are_told_from_those_with_a_handle_and_those_with_a_stripe() -> None:
