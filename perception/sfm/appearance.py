@@ -79,7 +79,7 @@ def likeness(model: Any, photos: Path, some: set[int], others: set[int]) -> floa
     compared, alike = counted(across)
     usual, usually = counted(within[:: max(1, -(-len(within) // PAIRS))])
     expected = (compared * usually / np.maximum(usual, 1)).sum()
-    return float(alike.sum() / expected) if expected and compared.sum() >= LEAST else 0.0
+    return float(alike[usual > 0].sum() / expected) if expected and compared.sum() >= LEAST else 0.0
 
 
 def _photo(image: Any, photos: Path) -> _Photo:

@@ -51,7 +51,6 @@ CANDIDATES = 4
 """Models mapped anew of which the best is used; two from all pairs, two from the stronger ones."""
 GUIDED = 8
 """Each photo left out is matched by guidance with so many photos, those with which it has most verified matches."""
-
 HELD = 0.5, 0.2
 """Shares of the matches of a pair, tried in turn, from which on it holds a photo where it is; by chance 0.13 agree."""
 
@@ -120,7 +119,7 @@ class Escalation:
         more = len(found.registered) - len(self.best.registered)
         if found.folded or self.best.folded:
             return more >= 0 and not found.folded
-        agrees = self.rival is None or found.support >= self.rival.support
+        agrees = found.support >= (self.rival.support if self.rival else 0)
         return more > 0 and agrees and not (self.trusted and self._doubtful(found))
 
     def _doubtful(self, found: Candidate) -> bool:
@@ -181,14 +180,14 @@ class Escalation:
             return None
         best = _best(found)
         for kept in sorted({each.registered for each in found if each.registered < best.registered}, key=sorted):
-            if moved := self._moved(best.models[0], kept, store):
+            if moved := self._moved(best, kept, store):
                 return _best([*found, moved])
         return best
 
-    def _moved(self, whole: Any, kept: frozenset[int], store: FeatureStore) -> Candidate | None:
-        """A model with the photos that are not `kept` where the pairs put them that contradict `whole`, if photos look
-        clearly more alike then. The pairs that held them in `whole` are wrong and deleted: they no longer count."""
-        taken = set(whole.reg_image_ids()) - kept
+    def _moved(self, found: Candidate, kept: frozenset[int], store: FeatureStore) -> Candidate | None:
+        """A candidate with the photos that are not `kept` where the pairs put them that contradict `found`, if photos
+        look clearly more alike then. The pairs that held them in `found` are wrong and deleted, so as not to count."""
+        whole, taken = found.models[0], found.registered - kept
         pairs = [pair for pair in verified_pairs(whole, store.database) if len({pair.i, pair.j} & taken) == 1]
         for share in HELD if len(kept) >= MIN_MODEL_SIZE else ():
             held = {(pair.i, pair.j) for pair in pairs if pair.share >= share}
@@ -198,11 +197,11 @@ class Escalation:
                 delete_pairs(less.database, held)
                 start = self._adjusted([merge.part_of(whole, set(kept))], less)
                 model = self._adjusted(self._mapped(start, less)[0][:1], less)
-            moved = taken & set(model.reg_image_ids())
+            moved = set(taken & set(model.reg_image_ids()))
             if moved and looks_better(model, whole, store.image_root, moved):
                 right = {(pair.i, pair.j) for pair in verified_pairs(model, store.database) if pair.agrees}
                 delete_pairs(store.database, {pair for pair in held - right if moved & set(pair)})
-                return self._checked([model], set(), store)
+                return self._checked([model], found.contradicted, store)
         return None
 
     def _parts_joined(self, model: Any, store: FeatureStore) -> list[Candidate]:
