@@ -136,9 +136,9 @@ def test_photos_are_moved_to_the_side_where_they_look_alike(room: tuple[Room, Es
     assert not looks_better(turned, right, place.store.image_root, block)
 
     before = set(verified_matches(place.store.database))
-    assert escalation._moved(right, others, place.store) is None
+    assert escalation._moved(Candidate([right], set(), place.store), others, place.store) is None
     assert set(verified_matches(place.store.database)) == before
-    moved = escalation._moved(turned, others, place.store)
+    moved = escalation._moved(Candidate([turned], set(), place.store), others, place.store)
     assert moved is not None and len(moved.registered) == PHOTOS
     assert place.off(moved.models[0]).max() < 0.02
     kept = set(verified_matches(place.store.database))
