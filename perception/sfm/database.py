@@ -6,6 +6,7 @@ import hashlib
 import json
 import shutil
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,14 @@ def verified_matches(database: Path) -> dict[tuple[int, int], np.ndarray]:
         keys, geometries = db.read_two_view_geometries()
     keyed = zip(map(pycolmap.pair_id_to_image_pair, keys), geometries, strict=True)
     return {pair: geometry.inlier_matches for pair, geometry in sorted(keyed, key=lambda item: item[0])}
+
+
+def delete_pairs(database: Path, pairs: Iterable[tuple[int, int]]) -> None:
+    """Deletes the matches of pairs of image ids."""
+    with load_pycolmap().Database.open(database) as db:
+        for pair in pairs:
+            db.delete_matches(*pair)
+            db.delete_two_view_geometry(*pair)
 
 
 def build_features(

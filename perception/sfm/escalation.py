@@ -8,8 +8,9 @@ from __future__ import annotations
 import shutil
 import time
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -19,13 +20,15 @@ from perception.geometry import align_similarity
 from perception.io.atomic import atomic_directory, recover
 from perception.photos.lens import load_pycolmap
 from perception.sfm import merge
+from perception.sfm.appearance import looks_better
 from perception.sfm.consistency import consistent_photos, fold_warnings, stronger_contradictions, verified_pairs
-from perception.sfm.database import FeatureStore, verified_matches
+from perception.sfm.database import FeatureStore, delete_pairs, verified_matches
 from perception.sfm.feature_tasks import write_part
 from perception.sfm.features import FEW_FEATURES, THOROUGH, Group, extract, match
 from perception.sfm.incremental import (
     MIN_MODEL_SIZE,
     REPEATABLE_PHOTOS,
+    Mapped,
     candidates,
     map_photos,
     pipeline_options,
@@ -48,6 +51,8 @@ CANDIDATES = 4
 """Models mapped anew of which the best is used; two from all pairs, two from the stronger ones."""
 GUIDED = 8
 """Each photo left out is matched by guidance with so many photos, those with which it has most verified matches."""
+HELD = 0.5, 0.2
+"""Shares of the matches of a pair, tried in turn, from which on it holds a photo where it is; by chance 0.13 agree."""
 
 
 @dataclass(frozen=True)
@@ -59,16 +64,16 @@ class Candidate:
     store: FeatureStore
 
     @cached_property
-    def registered(self) -> set[int]:
+    def registered(self) -> frozenset[int]:
         """Image ids of the photos of the largest model."""
-        return set(self.models[0].reg_image_ids()) if self.models else set()
+        return frozenset(self.models[0].reg_image_ids() if self.models else ())
 
-    @cached_property
+    @property
     def folded(self) -> bool:
         """Whether the largest model may be folded."""
         return bool(self.models) and bool(fold_warnings(self.models[0], self.store.database))
 
-    @cached_property
+    @property
     def support(self) -> int:
         """Verified matches of the pairs that agree with the largest model, less those of the pairs that contradict."""
         pairs = verified_pairs(self.models[0], self.store.database) if self.models else []
@@ -78,7 +83,7 @@ class Candidate:
 @dataclass
 class Escalation:
     """best: the candidate so far. groups: the photos of each camera (see `features`). fixed: intrinsics are kept.
-    more: THOROUGH features. known: models of these. support: of the best by the matches of `more`."""
+    more: THOROUGH features. known: models of these. rival: the best, with the points of `more`."""
 
     best: Candidate
     groups: list[Group]
@@ -86,7 +91,7 @@ class Escalation:
     options: ReadOptions
     more: FeatureStore | None = None
     known: list[Any] = field(default_factory=list)
-    support: int = 0
+    rival: Candidate | None = None
     trusted: bool = False
     """Whether half of the photos are in the models at once, and the matches of `more` contradict none of these."""
 
@@ -105,7 +110,7 @@ class Escalation:
             self.more = self.more or self._more_features()
             found = attempt(self.more)
             if found is not None and self._is_better(found):
-                self.best, self.support = found, found.support
+                self.best = self.rival = found
             spent = time.perf_counter() - started
             steps.append({"step": name, "registered": len(self.best.registered), "seconds": spent})
         return self.best, steps
@@ -114,7 +119,8 @@ class Escalation:
         more = len(found.registered) - len(self.best.registered)
         if found.folded or self.best.folded:
             return more >= 0 and not found.folded
-        return more > 0 and found.support >= self.support and not (self.trusted and self._doubtful(found))
+        agrees = found.support >= (self.rival.support if self.rival else 0)
+        return more > 0 and agrees and not (self.trusted and self._doubtful(found))
 
     def _doubtful(self, found: Candidate) -> bool:
         """Whether photos of the best lie elsewhere, or many pairs of one of them and a new one contradict the model."""
@@ -153,7 +159,7 @@ class Escalation:
         if self.best.folded or not self.best.models:
             return None
         start = self._adjusted(self.best.models[:1], store)
-        self.support = Candidate([start], set(), store).support
+        self.rival = Candidate([load_pycolmap().Reconstruction(start)], set(), store)
         many = 2 * len(self.best.registered) >= len(store.names)
         self.trusted = many and consistent_photos(verified_pairs(start, store.database)) == self.best.registered
         grown = [self._grown(start, store)]
@@ -170,7 +176,33 @@ class Escalation:
             found += self._parts_joined(whole, store)
             if len(found[-1].registered) == len(store.names) and not found[-1].folded:
                 break
-        return max(found, key=lambda each: (not each.folded, each.support), default=None)
+        if not found:
+            return None
+        best = _best(found)
+        for kept in sorted({each.registered for each in found if each.registered < best.registered}, key=sorted):
+            if moved := self._moved(best, kept, store):
+                return _best([*found, moved])
+        return best
+
+    def _moved(self, found: Candidate, kept: frozenset[int], store: FeatureStore) -> Candidate | None:
+        """A candidate with the photos that are not `kept` where the pairs put them that contradict `found`, if photos
+        look clearly more alike then. The pairs that held them in `found` are wrong and deleted, so as not to count."""
+        whole, taken = found.models[0], found.registered - kept
+        pairs = [pair for pair in verified_pairs(whole, store.database) if len({pair.i, pair.j} & taken) == 1]
+        for share in HELD if len(kept) >= MIN_MODEL_SIZE else ():
+            held = {(pair.i, pair.j) for pair in pairs if pair.share >= share}
+            with TemporaryDirectory(dir=store.folder) as folder:
+                less = replace(store, folder=Path(folder))
+                shutil.copyfile(store.database, less.database)
+                delete_pairs(less.database, held)
+                start = self._adjusted([merge.part_of(whole, set(kept))], less)
+                model = self._adjusted(self._mapped(start, less)[0][:1], less)
+            moved = set(taken & set(model.reg_image_ids()))
+            if moved and looks_better(model, whole, store.image_root, moved):
+                right = {(pair.i, pair.j) for pair in verified_pairs(model, store.database) if pair.agrees}
+                delete_pairs(store.database, {pair for pair in held - right if moved & set(pair)})
+                return self._checked([model], found.contradicted, store)
+        return None
 
     def _parts_joined(self, model: Any, store: FeatureStore) -> list[Candidate]:
         """One model of the two parts that matches divide in a folded one: these matches say where the second lies."""
@@ -203,11 +235,9 @@ class Escalation:
         for image in {image for pair in linked for image in pair} - self.best.registered:
             mine = [pair for pair in linked if image in pair]
             pairs |= set(sorted(mine, key=lambda pair: (-linked[pair], pair))[:GUIDED])
+        delete_pairs(guided.database, pairs)
         with load_pycolmap().Database.open(guided.database) as db:
             names = {image.image_id: image.name for image in db.read_all_images()}
-            for pair in pairs:
-                db.delete_matches(*pair)
-                db.delete_two_view_geometry(*pair)
         chosen = [(names[one], names[other]) for one, other in sorted(pairs)]
         match(guided.database, chosen, self.options.seed, self.options.progress, THOROUGH, guided=True)
         return self._grown(self._adjusted(self.best.models[:1], guided), guided)
@@ -230,10 +260,13 @@ class Escalation:
         return merge.adjusted(merge.merged(models), store, options, add=False)
 
     def _grown(self, start: Any, store: FeatureStore, again: bool = True, joined: bool = False) -> Candidate:
+        """`start` with photos added, checked."""
+        return self._checked(*self._mapped(start, store), store, again, joined)
+
+    def _mapped(self, start: Any, store: FeatureStore) -> Mapped:
         """`start` with photos added."""
         seed, count, progress = self.options.seed, len(store.names), self.options.progress
-        found = map_photos(store, self.fixed, seed, count, progress, one_thread=True, start=start)
-        return self._checked(*found, store, again, joined)
+        return map_photos(store, self.fixed, seed, count, progress, one_thread=True, start=start)
 
     def _checked(
         self, models: list[Any], contradicted: set[str], store: FeatureStore, again: bool = True, joined: bool = False
@@ -287,7 +320,15 @@ class Escalation:
                 extract(database, store.image_root, [each for each in groups if each[0]], progress, THOROUGH)
                 match(database, [(names[i], names[j]) for i, j in chosen], self.options.seed, progress, THOROUGH)
         facts = {**store.facts, "pairs_matched": len(verified_matches(folder / store.database.name))}
-        return FeatureStore(folder, store.image_root, names, facts, THOROUGH)
+        work = folder / "work"  # pairs are deleted from a copy: an interrupted call begins with all
+        shutil.rmtree(work, ignore_errors=True)
+        work.mkdir()
+        shutil.copyfile(folder / store.database.name, work / store.database.name)
+        return FeatureStore(work, store.image_root, names, facts, THOROUGH)
+
+
+def _best(found: list[Candidate]) -> Candidate:
+    return max(found, key=lambda each: (not each.folded, each.support))
 
 
 def _contradicted(model: Any, store: FeatureStore, joined: bool) -> set[int]:

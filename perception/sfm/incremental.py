@@ -13,7 +13,7 @@ from typing import Any
 from perception.photos.lens import load_pycolmap
 from perception.progress import Progress
 from perception.sfm.consistency import Pair, is_contradicted, outvoted_photos, verified_pairs
-from perception.sfm.database import FeatureStore
+from perception.sfm.database import FeatureStore, delete_pairs
 from perception.sfm.features import QUICK, Effort
 
 MIN_MODEL_SIZE = 3
@@ -114,10 +114,7 @@ class _Mapping:
     def _database_without(self, pairs: list[Pair]) -> Path:
         copy = self.folder / f"pairs-{self.runs}.db"
         shutil.copyfile(self.store.database, copy)
-        with load_pycolmap().Database.open(copy) as db:
-            for pair in pairs:
-                db.delete_matches(pair.i, pair.j)
-                db.delete_two_view_geometry(pair.i, pair.j)
+        delete_pairs(copy, [(pair.i, pair.j) for pair in pairs])
         return copy
 
     def _without_outvoted(self, models: list[Any]) -> Mapped:
