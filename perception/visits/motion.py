@@ -18,7 +18,7 @@ from perception.gaussians.model import Gaussians
 from perception.gaussians.views import TrainingView, expected_depth, render
 from perception.rasterizer.rasterize import rasterizer_for
 from perception.rasterizer.types import Settings
-from perception.visits.evidence import Signs, signs_from, sums_in
+from perception.visits.evidence import TEMPER, Signs, signs_from, sums_in
 from perception.visits.look import Look, blurred, projected
 from perception.visits.registration import BEST, TURNED, YAWS, Points, angle_between, looks_round, register, turns
 
@@ -315,6 +315,12 @@ def refined(old: Gaussians, start: Found, cuts: Sequence[Cut], depth: float, ste
         if gain < GAINS or np.abs(peak).max() < 0.5:
             step /= SHORTER
     return best
+
+
+def against(odds: float, rivals: np.ndarray) -> float:
+    """Log-odds of a pair, of which only one can be true together with each of its rivals: log-odds [R] of its things
+    with others, −∞ for none. As `evidence.probability` reads them: p = e^(o/T) / (1 + e^(o/T) + Σ e^(r/T))."""
+    return float(odds - TEMPER * np.log1p(np.exp(np.clip(rivals / TEMPER, -30, 30))[np.isfinite(rivals)].sum()))
 
 
 def assigned(odds: np.ndarray, least: float = 0.0) -> list[tuple[int, int]]:

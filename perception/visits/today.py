@@ -12,7 +12,7 @@ from perception.gaussians.state import TrainRecord
 from perception.instances.group import Grouping
 from perception.instances.votes import mask_votes
 from perception.map.history import is_removed
-from perception.visits.evidence import Signs, seen_rows, signs_of
+from perception.visits.evidence import Signs, probability, seen_rows, signs_of
 from perception.visits.growth import (
     GROWING,
     SETTLING,
@@ -33,6 +33,7 @@ from perception.visits.motion import (
     MOVED,
     TWINS,
     Motion,
+    against,
     assigned,
     motions_of,
     settled,
@@ -55,9 +56,9 @@ OUTLINED = 0.5
 @dataclass
 class Today:
     """What stands where today: the Gaussians, of which the first rows are the rows `kept` [H] of the map; ids [N] int32
-    instance, `membership` [N], part_ids [N]; signs of the map's instances, in their order; `gone`: ids of those that do
-    not stand where they stood; motions by id; `added`: of the new ones, by id, the score and whether the old map
-    showed it."""
+    instance, `membership` [N], part_ids [N]; signs of the map's instances, in their order; `gone`: of those that do not
+    stand where they stood, by id, the probability that no new thing is it; motions by id; `added`: of the new ones, by
+    id, the score and whether the old map showed it."""
 
     gaussians: Gaussians
     kept: np.ndarray
@@ -65,7 +66,7 @@ class Today:
     membership: np.ndarray
     part_ids: np.ndarray
     signs: list[Signs]
-    gone: list[int]
+    gone: dict[int, float]
     motions: dict[int, Motion]
     added: dict[int, tuple[float, bool]]
     record: TrainRecord
@@ -109,8 +110,9 @@ def seen_today(visit: Visit) -> Today:
         stands = [j for j in range(len(things)) if j not in ground]
         things, old = [things[j] for j in stands], {n for n, j in enumerate(stands) if j in old}
     with run.stage("motion"):
-        pairs = _moved(visit, grown, things, gone)
-    return _settled(visit, grown, kept, ids, made, free, signs, gone, things, old, pairs, record)
+        pairs, nowhere = _moved(visit, grown, things, gone)
+    lost = dict(zip(gone, nowhere, strict=True))
+    return _settled(visit, grown, kept, ids, made, free, signs, lost, things, old, pairs, record)
 
 
 def _rows(things: list[tuple[np.ndarray, float]], numbers: set[int]) -> np.ndarray:
@@ -155,18 +157,19 @@ def _shown_before(
     anywhere = np.full(len(things), np.inf)  # what is in front of the old surface counts, too
     signs = signs_of(looks, range(len(things)), np.ones(len(things)), anywhere)
     fresh = instead > INSTEAD * pixels
-    old = {j for j, each in enumerate(signs) if each.photos and each.log_odds > 0 and not fresh[j]}
+    stood = {j for j, each in enumerate(signs) if each.photos and each.log_odds > 0 and not fresh[j]}
     usual = [each.outline for each in known if each.log_odds > 0 and np.isfinite(each.outline)]
     least = OUTLINED * float(np.median(usual or 1.0))
-    return old, {j for j, each in enumerate(signs) if not each.photos or each.outline < least}
+    return stood, {j for j, each in enumerate(signs) if not each.photos or each.outline < least}
 
 
 def _moved(
     visit: Visit, grown: Gaussians, things: list[tuple[np.ndarray, float]], gone: list[int]
-) -> dict[int, tuple[int, Motion]]:
-    """By id of an instance that is gone: the number of the new thing that it is, and its motion."""
+) -> tuple[dict[int, tuple[int, Motion]], list[float]]:
+    """By id of an instance that is gone: the number of the new thing that it is, and its motion. Of each of `gone`, the
+    probability that no new thing is it."""
     if not gone or not things:
-        return {}
+        return {}, [1.0] * len(gone)
     olds = {i: visit.thing(i) for i in gone}
     depth = {entry["id"]: min(entry["obb"]["extent"]) for entry in visit.gmap.instances}
     gravity = visit.gmap.info.get("gravity")
@@ -187,12 +190,13 @@ def _moved(
             motion = settled(olds[gone[a]], found, cuts, up, depth[gone[a]], alike[a])
             odds[a, j], motions[a, j] = motion.odds, motion
         visit.run.progress.update("motions", j + 1, len(things))
-    pairs = {}
-    for a, j in assigned(odds, MOVED):
+    for (a, j), motion in motions.items():
         rivals = np.concatenate([np.delete(odds[:, j], a), np.delete(odds[a], j)])
-        unsure = rivals.max(initial=-np.inf) > odds[a, j] - CLOSE
-        pairs[gone[a]] = (j, replace(motions[a, j], ambiguous=motions[a, j].ambiguous or bool(unsure)))
-    return pairs
+        unsure = motion.ambiguous or bool(rivals.max(initial=-np.inf) > odds[a, j] - CLOSE)
+        motions[a, j] = replace(motion, odds=against(odds[a, j], rivals), ambiguous=unsure)
+    pairs = {gone[a]: (j, motions[a, j]) for a, j in assigned(odds, MOVED)}
+    best = [max((motions[pair].odds for pair in motions if pair[0] == a), default=-np.inf) for a in range(len(gone))]
+    return pairs, [1 - probability(each) for each in best]
 
 
 def _settled(
@@ -203,7 +207,7 @@ def _settled(
     made: Grouping,
     free: np.ndarray,
     signs: list[Signs],
-    gone: list[int],
+    gone: dict[int, float],
     things: list[tuple[np.ndarray, float]],
     old: set[int],
     pairs: dict[int, tuple[int, Motion]],
@@ -244,7 +248,7 @@ def _settled(
     unseen = (final.sh[: len(kept)] == start[: len(kept)]).flatten(1).all(dim=1)
     original = torch.from_numpy(gmap.sh[kept])
     final.sh[: len(kept)] = torch.where(unseen[:, None, None], original, final.sh[: len(kept)])
-    rest = np.setdiff1d(np.flatnonzero(~np.isin(gmap.instance_ids, gone)), visit.rows)  # no photo may show these
+    rest = np.setdiff1d(np.flatnonzero(~np.isin(gmap.instance_ids, list(gone))), visit.rows)  # no photo may show these
     whole = Gaussians.concatenate([gaussians_of(gmap, rest), final])
     names, members, owned = [gmap.instance_ids[rest], *names], [gmap.membership[rest], *members], [parts[rest], *owned]
     arrays = (np.concatenate(names).astype(np.int32), np.concatenate(members), np.concatenate(owned).astype(np.int32))

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from perception.gaussians.model import Gaussians, isotropic
 from perception.gaussians.views import TrainingView, render
 from perception.instances.group import Grouping
-from perception.visits.motion import Cut, assigned, judged, refined
+from perception.visits.evidence import TEMPER, probability
+from perception.visits.motion import Cut, against, assigned, judged, refined
 from perception.visits.registration import Points, angle_between, carried, compact, looks_round, register
 from perception.visits.today import _without_fragments
 from support.aimed import look_at
@@ -129,6 +130,15 @@ def test_pairs_have_the_largest_sum_of_log_odds() -> None:
         best = max(sum(max(0.0, odds[i, j] - 1) for i, j in enumerate(order)) for order in permutations(range(4)))
         pairs = assigned(odds, 1.0)
         assert np.isclose(sum(odds[i, j] - 1 for i, j in pairs), best) and all(odds[i, j] > 1 for i, j in pairs)
+
+
+def test_of_look_alikes_each_is_as_likely_as_its_odds_say() -> None:
+    """Softmax over the pair, its rivals and none of them is the oracle."""
+    for odds, rivals in ((6.0, [6.0]), (6.0, [5.0, -1.0]), (3.0, []), (2.0, [-np.inf, 1.0])):
+        choices = np.exp(np.array([odds, 0.0, *rivals]) / TEMPER)
+        found = probability(against(odds, np.array(rivals)))
+        assert abs(found - choices[0] / choices.sum()) < 1e-9
+    assert abs(probability(against(40.0, np.array([40.0]))) - 0.5) < 1e-6
 
 
 def test_small_groups_in_hardly_any_mask_are_no_things() -> None:
