@@ -18,7 +18,7 @@ from perception.gaussians.model import Gaussians
 from perception.gaussians.views import TrainingView, expected_depth, render
 from perception.rasterizer.rasterize import rasterizer_for
 from perception.rasterizer.types import Settings
-from perception.visits.evidence import TEMPER, Signs, signs_from, sums_in
+from perception.visits.evidence import Signs, signs_from, sums_in
 from perception.visits.look import Look, blurred, projected
 from perception.visits.registration import BEST, TURNED, YAWS, Points, angle_between, looks_round, register, turns
 
@@ -317,12 +317,6 @@ def refined(old: Gaussians, start: Found, cuts: Sequence[Cut], depth: float, ste
     return best
 
 
-def against(odds: float, rivals: np.ndarray) -> float:
-    """Log-odds of a pair, of which only one can be true together with each of its rivals: log-odds [R] of its things
-    with others, −∞ for none. As `evidence.probability` reads them: p = e^(o/T) / (1 + e^(o/T) + Σ e^(r/T))."""
-    return float(odds - TEMPER * np.log1p(np.exp(np.clip(rivals / TEMPER, -30, 30))[np.isfinite(rivals)].sum()))
-
-
 def assigned(odds: np.ndarray, least: float = 0.0) -> list[tuple[int, int]]:
     """Pairs (old, new) of the joint assignment with the largest sum of log-odds [O, N] above `least`."""
     from scipy.optimize import linear_sum_assignment
@@ -330,3 +324,26 @@ def assigned(odds: np.ndarray, least: float = 0.0) -> list[tuple[int, int]]:
     gain = np.maximum(np.where(np.isfinite(odds), odds - least, 0), 0)
     rows, columns = linear_sum_assignment(-gain)
     return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if gain[i, j] > 0]
+
+
+def against(odds: np.ndarray, a: int, j: int) -> float:
+    """Log-odds of the pair (a, j), of log-odds [O, N] of all pairs: of the likeliest assignment with it, over the
+    likeliest without it."""
+    without = odds.copy()
+    without[a, j] = -np.inf
+    return _with(odds, a, j) - _likeliest(without)
+
+
+def nowhere(odds: np.ndarray, a: int) -> float:
+    """Log-odds that thing `a` has no partner, of log-odds [O, N] of all pairs."""
+    known = np.flatnonzero(np.isfinite(odds[a])).tolist()
+    return _likeliest(np.delete(odds, a, axis=0)) - max((_with(odds, a, j) for j in known), default=-np.inf)
+
+
+def _with(odds: np.ndarray, a: int, j: int) -> float:
+    return float(odds[a, j]) + _likeliest(np.delete(np.delete(odds, a, axis=0), j, axis=1))
+
+
+def _likeliest(odds: np.ndarray) -> float:
+    """The largest sum of an assignment."""
+    return float(sum(odds[pair] for pair in assigned(odds)))

@@ -36,6 +36,7 @@ from perception.visits.motion import (
     against,
     assigned,
     motions_of,
+    nowhere,
     settled,
 )
 from perception.visits.registration import carried, looks_alike
@@ -110,9 +111,9 @@ def seen_today(visit: Visit) -> Today:
         stands = [j for j in range(len(things)) if j not in ground]
         things, old = [things[j] for j in stands], {n for n, j in enumerate(stands) if j in old}
     with run.stage("motion"):
-        pairs, nowhere = _moved(visit, grown, things, gone)
-    lost = dict(zip(gone, nowhere, strict=True))
-    return _settled(visit, grown, kept, ids, made, free, signs, lost, things, old, pairs, record)
+        pairs, lost = _moved(visit, grown, things, gone)
+    unfound = dict(zip(gone, lost, strict=True))
+    return _settled(visit, grown, kept, ids, made, free, signs, unfound, things, old, pairs, record)
 
 
 def _rows(things: list[tuple[np.ndarray, float]], numbers: set[int]) -> np.ndarray:
@@ -190,13 +191,12 @@ def _moved(
             motion = settled(olds[gone[a]], found, cuts, up, depth[gone[a]], alike[a])
             odds[a, j], motions[a, j] = motion.odds, motion
         visit.run.progress.update("motions", j + 1, len(things))
-    for (a, j), motion in motions.items():
+    pairs = {}
+    for a, j in assigned(odds, MOVED):
         rivals = np.concatenate([np.delete(odds[:, j], a), np.delete(odds[a], j)])
-        unsure = motion.ambiguous or bool(rivals.max(initial=-np.inf) > odds[a, j] - CLOSE)
-        motions[a, j] = replace(motion, odds=against(odds[a, j], rivals), ambiguous=unsure)
-    pairs = {gone[a]: (j, motions[a, j]) for a, j in assigned(odds, MOVED)}
-    best = [max((motions[pair].odds for pair in motions if pair[0] == a), default=-np.inf) for a in range(len(gone))]
-    return pairs, [1 - probability(each) for each in best]
+        unsure = motions[a, j].ambiguous or bool(rivals.max(initial=-np.inf) > odds[a, j] - CLOSE)
+        pairs[gone[a]] = (j, replace(motions[a, j], odds=against(odds, a, j), ambiguous=unsure))
+    return pairs, [probability(nowhere(odds, a)) for a in range(len(gone))]
 
 
 def _settled(
