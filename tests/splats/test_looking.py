@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from perception.errors import InputError
 from perception.geometry import camera_centres
 from perception.splats.cameras import FIVE, Chosen, choose_views
-from perception.splats.gravity import direction
+from perception.splats.gravity import direction, planes
 from perception.splats.panoramas import Survey, _grid, proxy_of, survey
 from perception.splats.read import Splat, read_splat
 from perception.splats.scene import drawn, rendered
@@ -105,6 +106,21 @@ def test_floaters_and_haze_are_told_and_nothing_else(tmp_path: Path) -> None:
     hidden = floaters(splat)
     assert hidden[thing == -1].mean() > 0.9  # of random places one may touch the table
     assert not hidden[thing >= 0].any()
+
+
+def test_planes_are_found_in_little_memory() -> None:
+    """Three planes of known sizes and directions, in a scene most of whose voxels no place sees."""
+    axes, rng = TURNS["tilted"], np.random.default_rng(0)
+    normals, areas = np.zeros((200_000, 3)), np.zeros(200_000)
+    normals[:6000] = np.repeat(axes, [3000, 2000, 1000], axis=0) + rng.normal(0, 0.02, (6000, 3))
+    normals[:6000] /= np.linalg.norm(normals[:6000], axis=1, keepdims=True)
+    areas[:6000] = 1.0
+    tracemalloc.start()
+    found = planes(normals, areas)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert np.all(np.abs(np.diag(np.array(found) @ axes.T)) > np.cos(np.radians(1)))
+    assert peak < 10 * normals.nbytes
 
 
 def test_up_is_read(tmp_path: Path) -> None:
