@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from perception.errors import InputError
 from perception.geometry import camera_centres
-from perception.splats.cameras import FIVE, Chosen, choose_views
+from perception.splats.cameras import FIVE, MOST_VIEWS, Chosen, choose_views
 from perception.splats.gravity import direction, planes
 from perception.splats.panoramas import Survey, _grid, proxy_of, survey
 from perception.splats.read import Splat, read_splat
@@ -78,6 +78,22 @@ def test_a_thing_in_empty_space_is_seen_from_all_sides(tmp_path: Path) -> None:
     assert np.all(np.linalg.norm(away, axis=1) < 6)
     yaw = np.sort(np.arctan2(away[:, 1], away[:, 0]))
     assert np.diff(np.append(yaw, yaw[0] + 2 * np.pi)).max() < np.pi / 2
+
+
+@pytest.mark.slow
+def test_every_room_of_a_building_is_entered(tmp_path: Path) -> None:
+    columns, _ = room_columns()
+    origins = [(SIDES[0] * i, SIDES[1] * j) for i in range(4) for j in range(2)]
+    tiled = {name: np.tile(x, len(origins)) for name, x in columns.items()}
+    for axis, name in enumerate("xy"):
+        tiled[name] = np.concatenate([columns[name] + origin[axis] for origin in origins])
+    splat = read_splat(write_room(tmp_path / "building.ply", tiled))
+    found, chosen = looked(splat, splat.parked, np.array([0.0, 0, 1]))
+    assert found.inside
+    assert MOST_VIEWS[0] < len(chosen.poses) <= MOST_VIEWS[1]
+    centres = camera_centres(chosen.poses)[:, :2]
+    for origin in origins:
+        assert np.sum(np.all((centres > origin) & (centres < origin + SIDES[:2]), axis=1)) > 30
 
 
 @pytest.mark.parametrize("side", [(1, 1, 1), (4, 3, 1e-3), (9, 0.1, 0.1), (2, 0, 0), (5, 3), (1, 0)])
