@@ -22,8 +22,8 @@ from perception.splats.panoramas import EPS, NEAREST, SIDE, Survey, pose_at, upr
 
 FIVE = 5.0
 """Views that each voxel is to be seen by."""
-MOST_VIEWS, VOXELS = (160, 640), 100
-"""Views of a scene of a room's size, and of any scene; more than the former are chosen one for so many voxels."""
+MOST_VIEWS = 160
+"""Of 640 views of a million Gaussians, grouping holds more than 11 GiB."""
 ENOUGH = 2e-4
 """Gain of the next view, as share of all there is to gain, at which no more are chosen."""
 ASPECT, FOCAL = 0.75, 0.8
@@ -134,12 +134,11 @@ def _greedy(
         seen, credit = views[view]
         return float((weight[seen] * np.minimum(credit, np.maximum(FIVE - have[seen], 0))).sum())
 
-    most = int(np.clip(len(weight) / VOXELS, *MOST_VIEWS))
     queue = [(-gain(view), view) for view in range(len(views))]
     heapq.heapify(queue)
     order: list[int] = []
     least = ENOUGH * FIVE * float(weight.sum())
-    while queue and len(order) < most and -queue[0][0] >= least:
+    while queue and len(order) < MOST_VIEWS and -queue[0][0] >= least:
         view = heapq.heappop(queue)[1]
         now = gain(view)
         if queue and now < -queue[0][0]:

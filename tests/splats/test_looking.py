@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from perception.errors import InputError
 from perception.geometry import camera_centres
 from perception.splats import panoramas
-from perception.splats.cameras import FIVE, MOST_VIEWS, Chosen, choose_views
+from perception.splats.cameras import FIVE, Chosen, choose_views
 from perception.splats.gravity import direction, planes
 from perception.splats.panoramas import Survey, _grid, proxy_of, survey
 from perception.splats.read import Splat, read_splat
@@ -89,17 +89,18 @@ def test_a_thing_in_empty_space_is_seen_from_all_sides(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_building_is_seen_as_a_room_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(panoramas, "MOST_PLACES", 240)
-    monkeypatch.setattr(panoramas, "PLACES", 60)  # as coarse for six rooms as the grid is for a large building
+    monkeypatch.setattr(panoramas, "PLACES", 60)  # as coarse for four rooms as the grid is for a large building
     columns, _ = room_columns()
-    origins = [(SIDES[0] * i, SIDES[1] * j) for i in range(3) for j in range(2)]
+    origins = [(SIDES[0] * i, SIDES[1] * j) for i in range(2) for j in range(2)]
     tiled = {name: np.tile(x, len(origins)) for name, x in columns.items()}
     for axis, name in enumerate("xy"):
         tiled[name] = np.concatenate([columns[name] + origin[axis] for origin in origins])
     splat = read_splat(write_room(tmp_path / "building.ply", tiled))
     found, chosen = looked(splat, splat.parked, np.array([0.0, 0, 1]))
     assert found.inside
-    assert MOST_VIEWS[0] < len(chosen.poses) <= MOST_VIEWS[1]
-    assert np.mean(times_seen(splat, chosen.poses) >= FIVE) > 0.8
+    times = times_seen(splat, chosen.poses)
+    assert np.mean(times >= 2) > 0.9
+    assert np.mean(times >= FIVE) > 0.6
 
 
 @pytest.mark.parametrize("side", [(1, 1, 1), (4, 3, 1e-3), (9, 0.1, 0.1), (2, 0, 0), (5, 3), (1, 0)])

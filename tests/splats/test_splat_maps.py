@@ -26,7 +26,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, np.ndarr
     columns["quality"] = np.arange(len(thing), dtype=np.int32)
     source, output = write_room(folder / "room.ply", columns), folder / "room.gsmap"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cameras, "MOST_VIEWS", (24, 24))
+        patch.setattr(cameras, "MOST_VIEWS", 24)
         patch.setattr(panoramas, "PLACES", 120)
         assert main(["map", str(source), "-o", str(output), *OPTIONS, "--set", "train.iterations=300"]) == 0
     return source, output, thing
