@@ -43,8 +43,10 @@ def memberships(ids: np.ndarray, votes: MaskVotes) -> np.ndarray:
     count = int(ids.max(initial=-1)) + 1
     shares = mask_shares(votes.of_groups(ids, count))
     agreement = np.zeros(len(ids), np.float32)
-    for rows in _in_chunks(np.flatnonzero(ids >= 0), votes, count):
-        agreement[rows] = affinities(votes, shares, rows)[0][np.arange(len(rows)), ids[rows]]
+    for rows in _in_chunks(np.flatnonzero(ids >= 0), votes, int(np.diff(shares.indptr).max(initial=0))):
+        pixels = votes.pixels[rows]
+        own, total = (np.asarray(x.sum(axis=1)).reshape(-1) for x in (pixels.multiply(shares[ids[rows]]), pixels))
+        agreement[rows] = own / np.maximum(total, 1e-12)
     return np.clip(agreement, 0, 1)
 
 

@@ -69,11 +69,10 @@ def gravity_of(normals: np.ndarray, means: np.ndarray, open_rays: np.ndarray, ra
 
 def planes(normals: np.ndarray, areas: np.ndarray, most: int = 6) -> list[np.ndarray]:
     """The main directions [3] of normals [M, 3], of either sign, weighted by areas [M], largest first."""
-    left, found = areas.copy(), list[np.ndarray]()
-    trial = normals[np.argsort(-areas, kind="stable")[:400]]
-    while len(found) < most and left.sum() > 0.05 * areas.sum():
-        close = np.abs(trial @ normals.T) > LEVEL
-        start = trial[int((close * left).sum(axis=1).argmax())]
+    normals, left, found = normals[areas > 0], areas[areas > 0], list[np.ndarray]()
+    trial, least = normals[np.argsort(-left, kind="stable")[:400]], 0.05 * left.sum()
+    while len(found) < most and left.sum() > least:
+        start = max(trial, key=lambda one: float(left[np.abs(normals @ one) > LEVEL].sum()))
         for _ in range(5):
             cosine = normals @ start
             weights = left * (np.abs(cosine) > LEVEL) * np.sign(cosine)

@@ -27,6 +27,8 @@ from perception.splats.gravity import gravity_of
 
 PLACES, SIDE = 240, 48
 """Places of the grid, and pixels of a face of a panorama."""
+MOST_PLACES, STEP = 960, 0.7
+"""Places of the grid within a building, if more than PLACES; their distance relative to the median distance."""
 PROXY = 150_000
 """Gaussians that panoramas are rendered of; of more, every k-th is taken, enlarged."""
 EPS = 0.01
@@ -119,7 +121,10 @@ def survey(proxy: Gaussians, means: np.ndarray, up: np.ndarray | None, progress:
         gravity = _gravity(places, means, rays, up, enclosed=False)
         if (gravity.direction != before.direction).any():
             outer = _outer(proxy, means, gravity, progress)
-    if not inside:
+    if inside:
+        finer, level = _finer(proxy, means, gravity, _typical(within), progress)
+        within, rays = (finer, level) if finer else (within, rays)
+    else:
         within, rays = (outer, _rays() @ upright_axes(-gravity.direction)) if outer else (places, rays)
     places, typical = within, _typical(within)
     size = VOXEL * typical
@@ -151,6 +156,24 @@ def _outer(proxy: Gaussians, means: np.ndarray, gravity: Gravity, progress: Prog
     axes = upright_axes(-gravity.direction)
     around = _around(*_box(means @ axes.T)) @ axes
     return [p for p in _panoramas(proxy, around, axes, progress) if p.hit.any()]
+
+
+def _finer(
+    proxy: Gaussians, means: np.ndarray, gravity: Gravity, typical: float, progress: Progress
+) -> tuple[list[Panorama], np.ndarray]:
+    """The well placed of a grid as fine as a building needs, and their rays; none in a scene of a room's size.
+    typical: median distance."""
+    axes = upright_axes(-gravity.direction)
+    low, high = _box(means @ axes.T)
+    low[2], high[2] = low[2] + np.array(HEIGHTS) * (high[2] - low[2])
+    count = int(min(np.prod(high - low) / (STEP * typical) ** 3, MOST_PLACES))
+    if count <= PLACES:
+        return [], np.zeros((0, 3))
+    places = [p for p in _panoramas(proxy, _grid(low, high, count) @ axes, axes, progress) if p.hit.any()]
+    places = [p for p in places if np.quantile(p.distance[p.hit], 0.02) > NEAREST * typical]
+    rays = _rays() @ axes
+    places, found = _well_placed(places, means, -gravity.direction, rays)
+    return places if found else [], rays
 
 
 def _well_placed(

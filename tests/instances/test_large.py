@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import sparse
 from sklearn.metrics import adjusted_rand_score
 
 pytest.importorskip("perception._core")
 from perception.instances import assign, consensus
+from perception.instances.votes import MaskVotes
 from speed.grouping import building, grouped
 
 
@@ -41,3 +43,17 @@ def test_tables_of_many_photos_are_made_in_parts(monkeypatch: pytest.MonkeyPatch
     masks = made[2].pixels.shape[1]
     assert len(nodes) > 100 and max(nodes) <= 5_000 + masks
     assert len(weights) > 10 and max(weights) < 1.5 * 100_000 / 4  # of 60 weights for each Gaussian
+
+
+def test_membership_is_the_share_of_the_pixels_in_the_masks_of_the_instance() -> None:
+    """By an oracle of dense tables."""
+    rng = np.random.default_rng(3)
+    view = np.repeat(np.arange(5), 3)
+    pixels = rng.random((80, 15)) * (rng.random((80, 15)) < 0.4)
+    ids = rng.integers(-1, 6, 80).astype(np.int32)
+    tables = [sparse.csr_matrix(table.astype(np.float32)) for table in (pixels, np.zeros((80, 5)))]
+    found = assign.memberships(ids, MaskVotes(*tables, view, np.full(15, 9.0)))
+    of_group = np.array([pixels[ids == k].sum(axis=0) for k in range(6)])
+    shares = of_group / np.maximum(of_group @ (view[:, None] == view), 1e-12)
+    expected = (pixels * shares[ids]).sum(axis=1) / np.maximum(pixels.sum(axis=1), 1e-12)
+    np.testing.assert_allclose(found, np.where(ids >= 0, expected, 0), atol=1e-6)
