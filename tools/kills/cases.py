@@ -1,4 +1,4 @@
-"""What is killed: mapping, exporting, editing, upgrading, and what must hold afterwards."""
+"""What is killed: mapping, updating, exporting, editing, upgrading, and what must hold afterwards."""
 
 from __future__ import annotations
 
@@ -139,6 +139,19 @@ class Mapping(Case):
         assert names(place) == ["out.gsmap"], names(place)
         assert (place / "out.gsmap" / "report.html").read_text().rstrip().endswith("</html>")
         return contents(place / "out.gsmap"), names(place / "out.gsmap")
+
+
+class Updating(Mapping):
+    """`perception update` of the map `old` with the photos of another visit."""
+
+    name = "updating"
+
+    def __init__(self, old: Path, visit: Path):
+        self.old, self.visit = old, visit
+
+    def words(self, out: Path) -> list[str]:
+        masks = f"labels:{self.visit / 'labels'}"
+        return ["update", str(self.old), str(self.visit), "-o", str(out), "--masks", masks]
 
 
 class Exporting(Case):

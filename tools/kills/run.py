@@ -1,4 +1,4 @@
-"""Kills mapping, exporting and label editing at random moments; afterwards nothing may be lost.
+"""Kills mapping, updating, exporting and label editing at random moments; afterwards nothing may be lost.
 
     python tools kills.run                     # 100 kills of each, about 20 minutes on two cores
     python tools kills.run save upgrade export # in a map's folder that holds photos and notes, too
@@ -31,10 +31,10 @@ from typing import Any
 import numpy as np
 
 from kills import children
-from kills.cases import KEPT, Case, Editing, Exporting, Keeping, Mapping, command
+from kills.cases import KEPT, Case, Editing, Exporting, Keeping, Mapping, Updating, command
 from kills.children import Moment
 
-NAMES = ("mapping", "exporting", "editing", *KEPT)
+NAMES = ("mapping", "updating", "exporting", "editing", *KEPT)
 FINAL = 40
 """Changes to the file system that count as the end of a run."""
 RESUME_KILLED = 0.25
@@ -112,7 +112,13 @@ def _cases(folder: Path, args: argparse.Namespace) -> dict[str, Case]:
     (first / "out").mkdir()
     exporting = Exporting(gmap, scene / "truth" / "gt_points.ply", first / "out")
     _do(lambda: exporting.export(first, "--no-smooth", "--color", "original"), folder)
-    kept = {name: Keeping(name, gmap) for name in KEPT}
+    kept: dict[str, Case] = {name: Keeping(name, gmap) for name in KEPT}
+    if "updating" in args.what:
+        earlier, later = (folder / "visits" / f"visit{n}" for n in range(2))
+        children.ask(lambda: _make_visits(folder / "visits"))
+        before = Mapping(earlier / "transforms.json", earlier / "labels", args.iterations)
+        _do(lambda: command(*before.words(folder / "before.gsmap")), folder)
+        kept["updating"] = Updating(folder / "before.gsmap", later)
     return {"mapping": mapping, "exporting": exporting, "editing": Editing(gmap), **kept}
 
 
@@ -134,6 +140,15 @@ def _make_scene(scene: Path) -> None:
     for name in truth.names[:9]:
         label = Path(name).with_suffix(".png").name
         shutil.copy(scene / "truth" / "labels" / label, scene / "labels" / label)
+
+
+def _make_visits(folder: Path) -> None:
+    """Two visits of a table of which some things go and others come."""
+    from worlds.visits import make_visits
+
+    share = {"moved": 0.1, "turned": 0.0, "removed": 0.1, "added": 0.1}
+    size = {"views": 14, "later_views": 9, "width": 160, "height": 120, "light_samples": 2, "seed": 3}
+    make_visits(folder, visits=2, share=share, **size)
 
 
 def _kill(case: Case, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
