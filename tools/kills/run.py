@@ -116,8 +116,8 @@ def _cases(folder: Path, args: argparse.Namespace) -> dict[str, Case]:
     if "updating" in args.what:
         earlier, later = (folder / "visits" / f"visit{n}" for n in range(2))
         children.ask(lambda: _make_visits(folder / "visits"))
-        before = Mapping(earlier / "transforms.json", earlier / "labels", args.iterations)
-        _do(lambda: command(*before.words(folder / "before.gsmap")), folder)
+        words = ("--masks", f"labels:{earlier / 'labels'}", "--iterations", 400, "--set", "language.encoder=none")
+        _do(lambda: command("map", earlier, "-o", folder / "before.gsmap", *words), folder)
         kept["updating"] = Updating(folder / "before.gsmap", later)
     return {"mapping": mapping, "exporting": exporting, "editing": Editing(gmap), **kept}
 
@@ -147,7 +147,7 @@ def _make_visits(folder: Path) -> None:
     from worlds.visits import make_visits
 
     share = {"moved": 0.1, "turned": 0.0, "removed": 0.1, "added": 0.1}
-    size = {"views": 14, "later_views": 9, "width": 160, "height": 120, "light_samples": 2, "seed": 3}
+    size = {"views": 20, "later_views": 10, "width": 160, "height": 120, "light_samples": 2, "seed": 3}
     make_visits(folder, visits=2, share=share, **size)
 
 
