@@ -303,8 +303,9 @@ def make_server(engine: QueryEngine, photos: Path | None = None) -> Server[Any]:
     return Server("perception", get_tool_input_schema=schemas.get, **handlers, **about)
 
 
-def serve_stdio(path: Path, photos: Path | None = None) -> None:
-    """Serves the map at `path` over standard input and output until the client ends. photos: see `best_crop`."""
+def serve_stdio(path: Path, encoders: Any = None, photos: Path | None = None) -> None:
+    """Serves the map at `path` over standard input and output until the client ends. encoders: of QueryEngine;
+    photos: see `best_crop`."""
 
     async def session(server: Server[Any]) -> None:
         async with stdio_server() as (read, write):
@@ -317,13 +318,13 @@ def serve_stdio(path: Path, photos: Path | None = None) -> None:
             if not isinstance(getattr(error, "exceptions", [error])[0], BrokenPipeError):
                 raise
 
-    with QueryEngine(path) as engine:  # Ctrl-C cannot end the thread, which waits for input
+    with QueryEngine(path, encoders=encoders) as engine:  # Ctrl-C cannot end the thread, which waits for input
         thread = threading.Thread(target=work, args=(make_server(engine, photos),), daemon=True)
         thread.start()
         thread.join()
 
 
-def serve_http(path: Path, settings: ServeSettings, photos: Path | None = None) -> None:
+def serve_http(path: Path, settings: ServeSettings, encoders: Any = None, photos: Path | None = None) -> None:
     """Serves the map at `path` over streamable HTTP until SIGINT or SIGTERM, with the checks of `serve`.
 
     No session is kept: each request is answered by itself, so a client may vanish at any time.
@@ -336,4 +337,4 @@ def serve_http(path: Path, settings: ServeSettings, photos: Path | None = None) 
         app.add_middleware(HttpGuard, settings=settings)
         return app
 
-    serve(path, settings, build=build, page="/mcp")
+    serve(path, settings, encoders, build, "/mcp")
