@@ -324,26 +324,3 @@ def assigned(odds: np.ndarray, least: float = 0.0) -> list[tuple[int, int]]:
     gain = np.maximum(np.where(np.isfinite(odds), odds - least, 0), 0)
     rows, columns = linear_sum_assignment(-gain)
     return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if gain[i, j] > 0]
-
-
-def against(odds: np.ndarray, a: int, j: int) -> float:
-    """Log-odds of the pair (a, j), of log-odds [O, N] of all pairs: of the likeliest assignment with it, over the
-    likeliest without it."""
-    without = odds.copy()
-    without[a, j] = -np.inf
-    return _with(odds, a, j) - _likeliest(without)
-
-
-def nowhere(odds: np.ndarray, a: int) -> float:
-    """Log-odds that thing `a` has no partner, of log-odds [O, N] of all pairs."""
-    known = np.flatnonzero(np.isfinite(odds[a])).tolist()
-    return _likeliest(np.delete(odds, a, axis=0)) - max((_with(odds, a, j) for j in known), default=-np.inf)
-
-
-def _with(odds: np.ndarray, a: int, j: int) -> float:
-    return float(odds[a, j]) + _likeliest(np.delete(np.delete(odds, a, axis=0), j, axis=1))
-
-
-def _likeliest(odds: np.ndarray) -> float:
-    """The largest sum of an assignment."""
-    return float(sum(odds[pair] for pair in assigned(odds)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -58,18 +58,15 @@ def with_geometry(entry: dict[str, Any], gaussians: Gaussians, rows: np.ndarray)
     return {**entry, **{key: made[key] for key in _GEOMETRY}}
 
 
-def recorded(
-    entry: dict[str, Any], visit: int, signs: Signs, motion: Motion | None, nowhere: float | None
-) -> dict[str, Any]:
-    """The entry of an old instance after a visit, still with its old geometry. nowhere: of one that does not stand
-    there, the probability that no new thing is it."""
+def recorded(entry: dict[str, Any], visit: int, signs: Signs, motion: Motion | None, gone: bool) -> dict[str, Any]:
+    """The entry of an old instance after a visit, still with its old geometry. gone: it does not stand there."""
     known = {"first_seen": 0, "last_seen": visit - 1, "last_looked_for": visit - 1}
     entry = {**{key: entry.get(key, value) for key, value in known.items()}, **entry}
     if is_removed(entry):
         return entry
     if not signs.seen:
         return {**entry, "state": "unseen", "confidence": round(1 - 0.5 * min(1.0, signs.share / UNSEEN), 3)}
-    if nowhere is None:
+    if not gone:
         return {
             **entry, "state": "unchanged", "confidence": round(probability(signs.log_odds), 3), "last_seen": visit,
             "last_looked_for": visit,
@@ -83,7 +80,7 @@ def recorded(
     past, sure = [*entry.get("past", ()), stood], 1 - probability(signs.log_odds)
     if motion is None:
         entry = {key: value for key, value in entry.items() if key != "parts"}
-        entry |= {"state": "removed", "confidence": round(sure * nowhere, 3), "num_gaussians": 0}
+        entry |= {"state": "removed", "confidence": round(sure, 3), "num_gaussians": 0}
     else:
         entry |= {"state": "moved", "confidence": round(sure * probability(motion.odds), 3), "last_seen": visit}
     return {**entry, "last_looked_for": visit, "past": past}
@@ -115,7 +112,7 @@ def kept_parts(
     return arrays
 
 
-def past_with(gmap: Map, gone: Iterable[int], until: int) -> dict[str, np.ndarray]:
+def past_with(gmap: Map, gone: Sequence[int], until: int) -> dict[str, np.ndarray]:
     """past.npz with the means of the instances that no longer stand where they stood."""
     rows = np.flatnonzero(np.isin(gmap.instance_ids, list(gone)))
     made = {

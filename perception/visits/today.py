@@ -12,7 +12,7 @@ from perception.gaussians.state import TrainRecord
 from perception.instances.group import Grouping
 from perception.instances.votes import mask_votes
 from perception.map.history import is_removed
-from perception.visits.evidence import Signs, probability, seen_rows, signs_of
+from perception.visits.evidence import Signs, seen_rows, signs_of
 from perception.visits.growth import (
     GROWING,
     SETTLING,
@@ -33,10 +33,8 @@ from perception.visits.motion import (
     MOVED,
     TWINS,
     Motion,
-    against,
     assigned,
     motions_of,
-    nowhere,
     settled,
 )
 from perception.visits.registration import carried, looks_alike
@@ -57,9 +55,9 @@ OUTLINED = 0.5
 @dataclass
 class Today:
     """What stands where today: the Gaussians, of which the first rows are the rows `kept` [H] of the map; ids [N] int32
-    instance, `membership` [N], part_ids [N]; signs of the map's instances, in their order; `gone`: of those that do not
-    stand where they stood, by id, the probability that no new thing is it; motions by id; `added`: of the new ones, by
-    id, the score and whether the old map showed it."""
+    instance, `membership` [N], part_ids [N]; signs of the map's instances, in their order; `gone`: ids of those that do
+    not stand where they stood; motions by id; `added`: of the new ones, by id, the score and whether the old map
+    showed it."""
 
     gaussians: Gaussians
     kept: np.ndarray
@@ -67,7 +65,7 @@ class Today:
     membership: np.ndarray
     part_ids: np.ndarray
     signs: list[Signs]
-    gone: dict[int, float]
+    gone: list[int]
     motions: dict[int, Motion]
     added: dict[int, tuple[float, bool]]
     record: TrainRecord
@@ -111,9 +109,8 @@ def seen_today(visit: Visit) -> Today:
         stands = [j for j in range(len(things)) if j not in ground]
         things, old = [things[j] for j in stands], {n for n, j in enumerate(stands) if j in old}
     with run.stage("motion"):
-        pairs, lost = _moved(visit, grown, things, gone)
-    unfound = dict(zip(gone, lost, strict=True))
-    return _settled(visit, grown, kept, ids, made, free, signs, unfound, things, old, pairs, record)
+        pairs = _moved(visit, grown, things, gone)
+    return _settled(visit, grown, kept, ids, made, free, signs, gone, things, old, pairs, record)
 
 
 def _rows(things: list[tuple[np.ndarray, float]], numbers: set[int]) -> np.ndarray:
@@ -158,19 +155,18 @@ def _shown_before(
     anywhere = np.full(len(things), np.inf)  # what is in front of the old surface counts, too
     signs = signs_of(looks, range(len(things)), np.ones(len(things)), anywhere)
     fresh = instead > INSTEAD * pixels
-    stood = {j for j, each in enumerate(signs) if each.photos and each.log_odds > 0 and not fresh[j]}
+    old = {j for j, each in enumerate(signs) if each.photos and each.log_odds > 0 and not fresh[j]}
     usual = [each.outline for each in known if each.log_odds > 0 and np.isfinite(each.outline)]
     least = OUTLINED * float(np.median(usual or 1.0))
-    return stood, {j for j, each in enumerate(signs) if not each.photos or each.outline < least}
+    return old, {j for j, each in enumerate(signs) if not each.photos or each.outline < least}
 
 
 def _moved(
     visit: Visit, grown: Gaussians, things: list[tuple[np.ndarray, float]], gone: list[int]
-) -> tuple[dict[int, tuple[int, Motion]], list[float]]:
-    """By id of an instance that is gone: the number of the new thing that it is, and its motion. Of each of `gone`, the
-    probability that no new thing is it."""
+) -> dict[int, tuple[int, Motion]]:
+    """By id of an instance that is gone: the number of the new thing that it is, and its motion."""
     if not gone or not things:
-        return {}, [1.0] * len(gone)
+        return {}
     olds = {i: visit.thing(i) for i in gone}
     depth = {entry["id"]: min(entry["obb"]["extent"]) for entry in visit.gmap.instances}
     gravity = visit.gmap.info.get("gravity")
@@ -194,9 +190,9 @@ def _moved(
     pairs = {}
     for a, j in assigned(odds, MOVED):
         rivals = np.concatenate([np.delete(odds[:, j], a), np.delete(odds[a], j)])
-        unsure = motions[a, j].ambiguous or bool(rivals.max(initial=-np.inf) > odds[a, j] - CLOSE)
-        pairs[gone[a]] = (j, replace(motions[a, j], odds=against(odds, a, j), ambiguous=unsure))
-    return pairs, [probability(nowhere(odds, a)) for a in range(len(gone))]
+        unsure = rivals.max(initial=-np.inf) > odds[a, j] - CLOSE
+        pairs[gone[a]] = (j, replace(motions[a, j], ambiguous=motions[a, j].ambiguous or bool(unsure)))
+    return pairs
 
 
 def _settled(
@@ -207,7 +203,7 @@ def _settled(
     made: Grouping,
     free: np.ndarray,
     signs: list[Signs],
-    gone: dict[int, float],
+    gone: list[int],
     things: list[tuple[np.ndarray, float]],
     old: set[int],
     pairs: dict[int, tuple[int, Motion]],
@@ -248,7 +244,7 @@ def _settled(
     unseen = (final.sh[: len(kept)] == start[: len(kept)]).flatten(1).all(dim=1)
     original = torch.from_numpy(gmap.sh[kept])
     final.sh[: len(kept)] = torch.where(unseen[:, None, None], original, final.sh[: len(kept)])
-    rest = np.setdiff1d(np.flatnonzero(~np.isin(gmap.instance_ids, list(gone))), visit.rows)  # no photo may show these
+    rest = np.setdiff1d(np.flatnonzero(~np.isin(gmap.instance_ids, gone)), visit.rows)  # no photo may show these
     whole = Gaussians.concatenate([gaussians_of(gmap, rest), final])
     names, members, owned = [gmap.instance_ids[rest], *names], [gmap.membership[rest], *members], [parts[rest], *owned]
     arrays = (np.concatenate(names).astype(np.int32), np.concatenate(members), np.concatenate(owned).astype(np.int32))

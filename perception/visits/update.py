@@ -135,7 +135,7 @@ def assembled(visit: Visit, today: Today, described: DescribedInstances, output:
     instances = []
     for entry, signs in zip(gmap.instances, today.signs, strict=True):
         motion, rows = today.motions.get(entry["id"]), np.flatnonzero(today.ids == entry["id"])
-        entry = recorded(entry, number, signs, motion, today.gone.get(entry["id"]))
+        entry = recorded(entry, number, signs, motion, entry["id"] in today.gone)
         if not is_removed(entry) and (motion is not None or len(rows) != entry["num_gaussians"]):
             entry = with_geometry(entry, gaussians, rows)
         instances.append(entry)

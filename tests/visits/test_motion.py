@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import permutations, product
+from itertools import permutations
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from perception.gaussians.model import Gaussians, isotropic
 from perception.gaussians.views import TrainingView, render
 from perception.instances.group import Grouping
-from perception.visits.motion import Cut, against, assigned, judged, nowhere, refined
+from perception.visits.motion import Cut, assigned, judged, refined
 from perception.visits.registration import Points, angle_between, carried, compact, looks_round, register
 from perception.visits.today import _without_fragments
 from support.aimed import look_at
@@ -129,23 +129,6 @@ def test_pairs_have_the_largest_sum_of_log_odds() -> None:
         best = max(sum(max(0.0, odds[i, j] - 1) for i, j in enumerate(order)) for order in permutations(range(4)))
         pairs = assigned(odds, 1.0)
         assert np.isclose(sum(odds[i, j] - 1 for i, j in pairs), best) and all(odds[i, j] > 1 for i, j in pairs)
-
-
-def test_a_pair_of_look_alikes_is_as_likely_as_all_assignments_say() -> None:
-    """All assignments of up to three things are the oracle: each old one has a new one or none, no new one twice."""
-    rng = np.random.default_rng(7)
-    for old, new in ((1, 1), (2, 2), (3, 2), (2, 3)):
-        odds = np.where(rng.uniform(size=(old, new)) < 0.8, rng.normal(2, 3, (old, new)), -np.inf)
-        choices = [
-            c for c in product(range(-1, new), repeat=old) if len({j for j in c if j >= 0}) == sum(j >= 0 for j in c)
-        ]
-        sums = {c: sum(odds[a, j] for a, j in enumerate(c) if j >= 0) for c in choices}
-        for a, j in zip(*np.nonzero(np.isfinite(odds)), strict=True):
-            best, other = (max(sums[c] for c in choices if (c[a] == j) == true) for true in (True, False))
-            assert abs(against(odds, a, j) - (best - other)) < 1e-9
-        for a in range(old):
-            alone, paired = (max(sums[c] for c in choices if (c[a] < 0) == true) for true in (True, False))
-            assert nowhere(odds, a) == alone - paired or abs(nowhere(odds, a) - (alone - paired)) < 1e-9
 
 
 def test_small_groups_in_hardly_any_mask_are_no_things() -> None:
