@@ -338,4 +338,5 @@ inline emulation::ThreadIndex threadIdx;
 #define __shfl_xor_sync(mask, value, bits) emulation::shuffle(value, (emulation::current ^ (bits)), __LINE__)
 inline int __ffs(unsigned x) { return __builtin_ffs(static_cast<int>(x)); }
 inline int __popc(unsigned x) { return __builtin_popcount(x); }
+inline void atomicAdd(int *at, int value) { *at += value; }
 inline void atomicMin(int *at, int value) { *at = value < *at ? value : *at; }

@@ -25,6 +25,9 @@ std::map<std::string, Kernel> kernels = {
     {"forward_kernel", taking_pointers(perception::forward_kernel)},
     {"backward_kernel", taking_pointers(perception::backward_kernel)},
     {"reduce_kernel", taking_pointers(perception::reduce_kernel)},
+    {"adam_kernel", taking_pointers(perception::adam_kernel)},
+    {"ssim_kernel", taking_pointers(perception::ssim_kernel)},
+    {"photometric_kernel", taking_pointers(perception::photometric_kernel)},
 };
 uint64_t lane_order = 0;
 char module;
@@ -38,7 +41,8 @@ void emulator_memory(uint64_t begin, uint64_t bytes) { emulation::give_memory(be
 int emulator_struct_size(int which) {
   using namespace perception;
   const int sizes[] = {sizeof(Scene),  sizeof(Projection), sizeof(Strip),    sizeof(Lists),
-                       sizeof(Images), sizeof(Cotangents), sizeof(Gradients)};
+                       sizeof(Images), sizeof(Cotangents), sizeof(Gradients),  sizeof(AdamRows),
+                       sizeof(Photo)};
   return sizes[which];
 }
 

@@ -19,7 +19,7 @@ from perception.rasterizer.cuda.kernels import MAX_FEATURES, THREADS, KernelOpti
 from perception.rasterizer.types import Cotangents, Forward, Gradients, Inputs, Settings
 
 _POINTER = ctypes.c_void_p
-_TILE, _SPLAT, _MOMENTS = 16, 12, 10  # as in device.h: pixels, numbers of a splat, of a record before its features
+TILE, _SPLAT, _MOMENTS = 16, 12, 10  # as in device.h: pixels, numbers of a splat, of a record before its features
 _GAUSSIANS = ("means", "quats", "scales", "opacities", "colors", "features")
 _CAMERAS = ("viewmats", "Ks", "background")
 _MAX_RECORDS = 1 << 24  # with eight feature channels 1.2 GB of records, and 0.4 GB of lists
@@ -27,28 +27,33 @@ _AT_ONCE = 64  # labels whose weights are rendered at once
 _NO_LABEL = np.iinfo(np.int32).max  # beyond all labels
 
 
-def _structure(name: str, pointers: str, numbers: str = "", reals: str = "", real: Any = ctypes.c_float) -> Any:
-    """A struct of device.h: pointers first, then ints, then reals."""
+def structure(name: str, pointers: str, numbers: str = "", reals: str = "", real: Any = ctypes.c_float) -> Any:
+    """A struct of the kernels: pointers first, then ints, then reals."""
     kinds = [(pointers, _POINTER), (numbers, ctypes.c_int), (reals, real)]
     return type(name, (ctypes.Structure,), {"_fields_": [(n, kind) for names, kind in kinds for n in names.split()]})
 
 
-_SCENE = (
+def structures(name: str, pointers: str, numbers: str, reals: str) -> dict[torch.dtype, Any]:
+    """The struct for each type of the kernels' real numbers."""
+    kinds = {torch.float32: ctypes.c_float, torch.float64: ctypes.c_double}
+    return {dtype: structure(name, pointers, numbers, reals, real) for dtype, real in kinds.items()}
+
+
+SCENES = structures(
+    "Scene",
     "means quats scales opacities colors features viewmat K background",
     "n sh_degree sh_stride dims width height",
     "near_plane eps2d",
 )
-_REALS = {torch.float32: ctypes.c_float, torch.float64: ctypes.c_double}
-SCENES = {dtype: _structure("Scene", *_SCENE, real) for dtype, real in _REALS.items()}
-PROJECTION = _structure("Projection", "splats boxes depths radii first_bad")
-STRIP = _structure("Strip", "splats boxes front_to_back ends", "n first_row end_row tiles_x")
-LISTS = _structure("Lists", "ids slots starts")
-IMAGES = _structure("Images", "colors alphas depths features variance visible")
-COTANGENTS = _structure("Cotangents", "colors alphas depths features variance")
-GRADIENTS = _structure("Gradients", "means quats scales opacities colors features camera mean2d")
+PROJECTION = structure("Projection", "splats boxes depths radii first_bad")
+STRIP = structure("Strip", "splats boxes front_to_back ends", "n first_row end_row tiles_x")
+LISTS = structure("Lists", "ids slots starts")
+IMAGES = structure("Images", "colors alphas depths features variance visible")
+COTANGENTS = structure("Cotangents", "colors alphas depths features variance")
+GRADIENTS = structure("Gradients", "means quats scales opacities colors features camera mean2d")
 
 
-def _filled(structure: Any, **values: Tensor | int | float | None) -> Any:
+def filled(structure: Any, **values: Tensor | int | float | None) -> Any:
     """A struct of values by name; a tensor gives its address."""
     return structure(**{name: _address(v) if isinstance(v, Tensor) else v for name, v in values.items()})
 
@@ -90,7 +95,7 @@ class _Call:
         self.means, features = inputs.means, inputs.features
         self.n, self.dims = len(self.means), 0 if features is None else features.shape[1]
         self.blocks = (self.n + THREADS - 1) // THREADS
-        self.tiles_x, self.tiles_y = ((size + _TILE - 1) // _TILE for size in (settings.width, settings.height))
+        self.tiles_x, self.tiles_y = ((size + TILE - 1) // TILE for size in (settings.width, settings.height))
         self.slices = range(0, max(self.dims, 1), MAX_FEATURES)  # of the feature channels, by the first of each
 
     def kernels(self, begin: int) -> Kernels:
@@ -102,7 +107,7 @@ class _Call:
 
     def scene(self, camera: int, begin: int = 0) -> Any:
         of, s = self.inputs, self.settings
-        return _filled(
+        return filled(
             SCENES[self.means.dtype],
             **{name: getattr(of, name) for name in _GAUSSIANS if name != "features"},
             **{name: getattr(s, name) for name in ("sh_degree", "width", "height", "near_plane", "eps2d")},
@@ -121,7 +126,7 @@ class _Call:
         splats, boxes = new((self.n, _SPLAT)), new((self.n, 4), dtype=torch.int32)
         depths = self.means.new_full((self.n,), torch.inf)
         first_bad = self.means.new_full((1,), self.n, dtype=torch.int32)
-        projection = _filled(PROJECTION, splats=splats, boxes=boxes, depths=depths, radii=radii, first_bad=first_bad)
+        projection = filled(PROJECTION, splats=splats, boxes=boxes, depths=depths, radii=radii, first_bad=first_bad)
         self.kernels(0).launch("project_kernel", self.blocks, self.scene(camera), projection)
         front_to_back = torch.sort(depths, stable=True).indices.to(torch.int32)
         view = {"splats": splats, "boxes": boxes, "front_to_back": front_to_back}
@@ -130,7 +135,7 @@ class _Call:
     def _strips(self, view: dict[str, Tensor], first_bad: Tensor, first: int, end: int) -> list[_Strip]:
         """The lists of tile rows [first, end), in halves while they have too many pairs."""
         kernels, counts = self.kernels(0), self.means.new_empty((self.n,), dtype=torch.int32)
-        strip = _filled(STRIP, **view, n=self.n, first_row=first, end_row=end, tiles_x=self.tiles_x)
+        strip = filled(STRIP, **view, n=self.n, first_row=first, end_row=end, tiles_x=self.tiles_x)
         kernels.launch("count_kernel", self.blocks, strip, _pointer(counts))
         ends = counts.cumsum(0)
         total, bad = torch.cat([ends[-1:], first_bad]).tolist() if self.n else (0, 0)  # waits for the device
@@ -150,7 +155,7 @@ class _Call:
         starts = torch.searchsorted(tiles, torch.arange(count + 1, dtype=tiles.dtype, device=tiles.device))
         lists = {"ids": ids[slots], "slots": slots, "starts": starts}
         kept = (*view.values(), ends, *lists.values())
-        return [_Strip(count, strip, _filled(LISTS, **lists), slots, kept)]
+        return [_Strip(count, strip, filled(LISTS, **lists), slots, kept)]
 
     def _refuse(self, index: int) -> None:
         """InputError for Gaussian `index`, or for a camera with -1."""
@@ -174,7 +179,7 @@ def _images(structure: Any, of: Forward | Cotangents, camera: int, begin: int, *
 
     own = {"colors": first(of.colors), "alphas": first(of.alphas), "depths": first(of.depths)}
     own |= {"features": channels(of.features), "variance": channels(of.feature_variance)}
-    return _filled(structure, **own | more)
+    return filled(structure, **own | more)
 
 
 def rasterize_forward(inputs: Inputs, settings: Settings) -> Forward:
@@ -216,7 +221,7 @@ def rasterize_backward(
             kernels, scene = call.kernels(begin), call.scene(camera, begin)
             read = _images(IMAGES, forward, camera, begin, alphas=forward.alphas[camera], visible=visible)
             cotangent = _images(COTANGENTS, cotangents, camera, begin)
-            added = _filled(
+            added = filled(
                 GRADIENTS,
                 **outputs,
                 features=None if features is None else features[:, begin:],

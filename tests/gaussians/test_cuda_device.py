@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
+from perception import _core
 from perception.rasterizer import cpu
 from perception.rasterizer import device as on_device
+from perception.rasterizer.cuda import training
 from perception.rasterizer.types import Cotangents, Gradients, Settings
 from support.rasterizer import EVERY_GRADIENT, IMAGES, cast, passed, scene
 
@@ -40,3 +43,37 @@ def test_float32_on_the_device_follows_float64_on_the_cpu(n, size, dims, sh_degr
         assert error <= 5 * cpu_error + 1e-5
     for a, b in zip(found, both_passes(cast(inputs), "cuda", torch.float32), strict=True):
         assert torch.equal(a, b)
+
+
+def random(*shape, seed=0):
+    return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("size", [(40, 57), (480, 640)])
+def test_the_photometric_loss_in_float32_follows_float64(size):
+    x, y, weight = random(*size, 3), random(*size, 3, seed=1), random(*size, seed=2).round(decimals=1)
+    exact = torch.empty_like(x)
+    wanted = _core.training.photometric(x, (255 * y).round().to(torch.uint8), weight, exact, 0.2)
+    on_gpu = [t.float().cuda() for t in (x, weight)]
+    found = [torch.empty_like(on_gpu[0]) for _ in range(2)]
+    for gradient in found:
+        values = training.photometric(on_gpu[0], (255 * y).round().to(torch.uint8).cuda(), on_gpu[1], gradient, 0.2)
+    assert [float(v) for v in values] == pytest.approx(list(wanted), rel=1e-5)
+    assert float((found[0].cpu() - exact).norm()) <= 1e-4 * float(exact.norm())
+    assert torch.equal(*found)
+
+
+@pytest.mark.parametrize("width", [1, 3, 48])
+def test_adam_in_float32_follows_float64(width):
+    tables = [random(5000, width, seed=s) for s in range(3)]
+    on_gpu = [t.float().cuda() for t in tables]
+    rates, visible = np.linspace(0.01, 0.1, width), (random(5000, seed=9) > 0.4).to(torch.uint8)
+    for step in range(1, 6):
+        gradient = random(5000, width, seed=10 + step) - 0.5
+        gradient[step] = torch.nan
+        arguments = visible, rates, step, 0.9, 0.999, 1e-15
+        wanted = _core.training.adam(tables[0], gradient, *tables[1:], *arguments)
+        inputs = on_gpu[0], gradient.float().cuda(), *on_gpu[1:], visible.cuda()
+        assert int(training.adam(*inputs, *arguments[1:])) == wanted
+    for found, exact in zip(on_gpu, tables, strict=True):
+        torch.testing.assert_close(found.cpu().double(), exact, rtol=1e-5, atol=1e-6)

@@ -10,6 +10,7 @@ import torch
 import perception
 from perception.rasterizer import cpu
 from perception.rasterizer import device as on_device
+from perception.rasterizer.cuda import training
 from perception.rasterizer.cuda.kernels import KernelOptions
 from perception.rasterizer.types import Cotangents, Gradients, Settings
 from support.cuda_emulator import REVERSED, build, emulate, emulated, find_compiler, on_emulator, wide_scene, worst
@@ -136,7 +137,13 @@ def test_non_finite_input_is_named(name, value):
 def test_structs_are_those_of_the_kernels():
     library = build(KernelOptions(5, True, True, double=True), None)
     ours = (on_device.SCENES[torch.float64], on_device.PROJECTION, on_device.STRIP, on_device.LISTS, on_device.IMAGES)
-    for i, structure in enumerate((*ours, on_device.COTANGENTS, on_device.GRADIENTS)):
+    more = (
+        on_device.COTANGENTS,
+        on_device.GRADIENTS,
+        training.ADAM_ROWS[torch.float64],
+        training.PHOTOS[torch.float64],
+    )
+    for i, structure in enumerate((*ours, *more)):
         assert library.emulator_struct_size(i) == ctypes.sizeof(structure)
 
 

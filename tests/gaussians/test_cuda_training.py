@@ -36,6 +36,12 @@ def random(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
+@pytest.fixture
+def kernels_of_the_emulator(monkeypatch):
+    monkeypatch.setattr(on_device, "device_kernels", emulated())
+
+
+@pytest.mark.usefixtures("kernels_of_the_emulator")
 @pytest.mark.parametrize("beta", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize("weights", [None, "some", "none count"])
 @pytest.mark.parametrize("size", [(40, 57), (3, 4)])
@@ -74,9 +80,11 @@ def test_sums_and_scaled_values():
     assert torch.equal(out, -3 * values)
 
 
+@pytest.mark.usefixtures("kernels_of_the_emulator")
+@pytest.mark.parametrize("rates", [np.linspace(0.01, 0.1, 5), np.full(5, 0.02)], ids=["by column", "one"])
 @pytest.mark.parametrize("masked", [False, True])
-def test_adam(masked):
-    count, rates = 300, np.linspace(0.01, 0.1, 5)
+def test_adam(masked, rates):
+    count = 300
     tables = [random(count, 5, seed=s) for s in range(3)]
     both = [[table.clone() for table in tables] for _ in range(2)]
     for step in range(1, 6):

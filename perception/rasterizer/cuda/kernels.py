@@ -24,7 +24,7 @@ Stream = Callable[[], AbstractContextManager[int]]
 THREADS = 256  # of a block, as in kernels.cu
 _TOO_NEW = (209, 218, 222)  # no kernel image, invalid PTX, unsupported PTX: the driver is older than the compiler
 _FILES = {
-    "cuda": ("kernels.cu", "device.h", "prepare.h", "forward.h", "backward.h", "reduce.h"),
+    "cuda": ("kernels.cu", "device.h", "prepare.h", "forward.h", "backward.h", "reduce.h", "training.h"),
     "rasterizer": ("constants.h", "projection_math.h", "spherical_harmonics.h"),
 }
 _CMATH = "#pragma once\nnamespace std { using ::sqrt; using ::fabs; }\n"  # NVRTC has the functions, but no headers

@@ -1,7 +1,8 @@
-"""The training kernels of `perception._core.training` for tensors on a device: the same arguments, made of torch's own.
+"""The training kernels of `perception._core.training` for tensors on a device: the same arguments.
 
-Results are those of the compiled kernels up to rounding. Figures come back as tensors of one element, so that no call
-waits for the device. No sum is made by atomic additions, so equal input gives equal bits on one device.
+Adam and the photometric loss are kernels of csrc/cuda/training.h; the rest is made of torch's operations. Results are
+those of the compiled kernels up to rounding. Figures come back as tensors of one element, so that no call waits for the
+device. No floating-point sum is made by atomic additions, so equal input gives equal bits on one device.
 """
 
 from __future__ import annotations
@@ -10,51 +11,62 @@ import numpy as np
 import torch
 from torch import Tensor
 
-_C1, _C2 = 0.01**2, 0.03**2  # Wang et al. 2004, dynamic range 1
-_RADIUS, _SIGMA = 5, 1.5
+from perception.rasterizer import device
+from perception.rasterizer.cuda.kernels import THREADS, KernelOptions, Kernels
+
+_TAPS = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+_WINDOW = {f"tap{i}": tap for i, tap in enumerate(_TAPS / _TAPS.sum())}
+"""Of SSIM (Wang et al. 2004): 11 pixels, σ = 1.5."""
+ADAM_ROWS = device.structures(
+    "AdamRows", "param first second grad rates visible skipped", "rows width", "rate beta1 beta2 eps root"
+)
+PHOTOS = device.structures(
+    "Photo",
+    "render target bytes weight total slopes gradient sums",
+    "width height channels tiles_x",
+    "beta " + " ".join(_WINDOW),
+)
 _PIECE = 1024
 """Pixels whose features are summed in float32; these sums are added in float64."""
+
+
+def _kernels(of: Tensor) -> Kernels:
+    return device.device_kernels(KernelOptions(0, False, False, of.dtype == torch.float64), of.device)
 
 
 def photometric(
     render: Tensor, target: Tensor, weight: Tensor | None, gradient: Tensor, beta: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """(loss, l1, ssim) of images [H, W, C] and d loss / d render into gradient. Derivation: kernels/photometric.h.
-
-    With E[·] the mean under the window: mx = E[x], my = E[y], square = E[x² + y²], product = E[x y],
-    ssim = a1 a2 / (b1 b2), a1 = 2 mx my + C1, a2 = 2 (product − mx my) + C2, b1 = mx² + my² + C1,
-    b2 = square − mx² − my² + C2. share: weight of an element of the image in the mean. by_…: d ssim / d each mean.
-    """
-    x, y = render, target.to(render.dtype) / 255 if target.dtype == torch.uint8 else target
-    weight = torch.ones_like(x[..., 0]) if weight is None else weight
-    share = weight[..., None] / (weight.double().sum() * x.shape[2]).clamp(min=1e-30).to(x.dtype)
-    difference = x - y
-    l1 = (difference.abs() * share).double().sum()
-    gradient.copy_(difference.sign() * share * (1 - beta))
-    if beta == 0:
-        return l1, l1, torch.full_like(l1, torch.nan)
-    mx, my, square, product = _blurred(x, y, x * x + y * y, x * y)
-    a1, a2 = 2 * mx * my + _C1, 2 * (product - mx * my) + _C2
-    b1 = mx * mx + my * my + _C1
-    b2 = square + _C1 + _C2 - b1
-    below = 1 / (b1 * b2)
-    ssim = a1 * a2 * below
-    by_mean = 2 * (my * (a2 - a1) * below - mx * ssim * (1 / b1 - 1 / b2))
-    by_mean, by_square, by_product = _blurred(share * by_mean, -share * ssim / b2, 2 * share * a1 * below)
-    gradient.add_(by_mean + 2 * x * by_square + y * by_product, alpha=-beta)
-    mean = (ssim * share).double().sum()
-    return (1 - beta) * l1 + beta * ((1 - ssim) * share).double().sum(), l1, mean
-
-
-def _blurred(*images: Tensor) -> tuple[Tensor, ...]:
-    """Each image [H, W, C] under SSIM's Gaussian window, zeros outside."""
-    taps = torch.exp(-0.5 * (torch.arange(-_RADIUS, _RADIUS + 1, dtype=torch.float64) / _SIGMA) ** 2)
-    window = (taps / taps.sum()).to(images[0]).view(1, 1, -1, 1)
-    planes = torch.cat(images, dim=2).permute(2, 0, 1)[:, None]
-    with torch.backends.cudnn.flags(enabled=False):  # which may round to TF32, and choose algorithms by their speed
-        down = torch.nn.functional.conv2d(planes, window, padding=(_RADIUS, 0))
-        both = torch.nn.functional.conv2d(down, window.transpose(2, 3), padding=(0, _RADIUS))
-    return both[:, 0].permute(1, 2, 0).split(images[0].shape[2], dim=2)
+    """(loss, l1, ssim) of images [H, W, C] and d loss / d render into gradient."""
+    height, width, channels = render.shape
+    if weight is None:
+        total = torch.full((), float(render.numel()), dtype=torch.float64, device=render.device)
+    else:
+        total = (weight.double().sum() * channels).clamp(min=1e-30)
+    tiles_x, tiles_y = ((size + device.TILE - 1) // device.TILE for size in (width, height))
+    sums, slopes = total.new_empty((tiles_x * tiles_y, 3)), render.new_empty((3, *render.shape))
+    whole = target.dtype == torch.uint8
+    photo = device.filled(
+        PHOTOS[render.dtype],
+        render=render,
+        target=None if whole else target,
+        bytes=target if whole else None,
+        weight=weight,
+        total=total,
+        slopes=slopes,
+        gradient=gradient,
+        sums=sums,
+        width=width,
+        height=height,
+        channels=channels,
+        tiles_x=tiles_x,
+        beta=beta,
+        **_WINDOW,
+    )
+    for name in ("ssim_kernel", "photometric_kernel"):
+        _kernels(render).launch(name, len(sums), photo)
+    l1, ssim, unlike = sums.sum(dim=0)
+    return (1 - beta) * l1 + beta * unlike, l1, ssim if beta else torch.full_like(l1, torch.nan)
 
 
 def prototypes(features: Tensor, slots: Tensor, counts: Tensor, first: Tensor, means: Tensor, scatter: Tensor) -> None:
@@ -114,15 +126,28 @@ def adam(
     step: int, beta1: float, beta2: float, eps: float,
 ) -> Tensor:  # fmt: skip
     """One Adam step in place on the visible rows of [N, W]; the number of rows skipped for a non-finite gradient."""
-    finite = grad.isfinite().all(dim=1)
-    wanted = torch.ones_like(finite) if visible is None else visible > 0
-    rows = (finite & wanted)[:, None]
-    first.copy_(torch.where(rows, beta1 * first + (1 - beta1) * grad, first))
-    second.copy_(torch.where(rows, beta2 * second + (1 - beta2) * grad * grad, second))
-    rates = torch.from_numpy(rate / (1 - beta1**step)).to(param)
-    length = second.sqrt() / (1 - beta2**step) ** 0.5 + eps
-    param.sub_(torch.where(rows, rates * first / length, 0.0))
-    return (wanted & ~finite).sum()
+    rate = rate / (1 - beta1**step)
+    rates = None if (rate == rate[0]).all() else torch.from_numpy(rate).to(param)
+    skipped = torch.zeros((), dtype=torch.int32, device=param.device)
+    rows = device.filled(
+        ADAM_ROWS[param.dtype],
+        param=param,
+        first=first,
+        second=second,
+        grad=grad,
+        rates=rates,
+        visible=visible,
+        skipped=skipped,
+        rows=param.shape[0],
+        width=param.shape[1],
+        rate=rate[0],
+        beta1=beta1,
+        beta2=beta2,
+        eps=eps,
+        root=(1 - beta2**step) ** -0.5,
+    )
+    _kernels(param).launch("adam_kernel", (param.numel() + THREADS - 1) // THREADS, rows)
+    return skipped
 
 
 def add_statistics(mean2d: Tensor, visible: Tensor, gradient: Tensor, seen: Tensor, scale: float) -> None:
