@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import pytest
+import torch
 
-from support.cuda_emulator import emulate
-from support.cuda_mutants import BARRIERS, SLIPS, is_noticed, mutant_scene
+from perception.rasterizer import device
+from perception.rasterizer.cuda import training
+from support.cuda_emulator import emulate, emulated
+from support.cuda_mutants import BARRIERS, SLIPS, TRAINING_BARRIERS, is_noticed, mutant_scene
 
 QUICK = 5  # a barrier of one warp, which no order of the lanes shows
 
@@ -16,6 +19,16 @@ QUICK = 5  # a barrier of one warp, which no order of the lanes shows
 def test_a_missing_barrier_is_noticed_in_the_order_of_the_lanes(edit):
     with pytest.raises(RuntimeError, match=r"without a barrier between|that no thread of the block wrote"):
         emulate(mutant_scene(), edit=edit)
+
+
+@pytest.mark.parametrize(
+    "edit", [pytest.param(e, marks=[pytest.mark.slow] * (i > 0)) for i, e in enumerate(TRAINING_BARRIERS)]
+)
+def test_a_missing_barrier_of_training_is_noticed(edit, monkeypatch):
+    monkeypatch.setattr(device, "device_kernels", emulated(edit=edit))
+    image = torch.rand(20, 30, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    with pytest.raises(RuntimeError, match=r"without a barrier between|that no thread of the block wrote"):
+        training.photometric(image, image.flip(0).contiguous(), None, torch.empty_like(image), 0.2)
 
 
 @pytest.mark.slow

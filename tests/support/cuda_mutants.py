@@ -23,6 +23,13 @@ BARRIERS = [
     ("p, memory, sums);\n      __syncwarp();", "p, memory, sums);"),
     ("memory.touched = touched;\n    __syncthreads();", "memory.touched = touched;"),
 ]
+TRAINING_BARRIERS = [
+    ("target_at(photo, at);\n    }\n    __syncthreads();", "target_at(photo, at);\n    }"),
+    ("rows[3][i] = product;\n    }\n    __syncthreads();", "rows[3][i] = product;\n    }"),
+    ("half /= 2) {\n    __syncthreads();", "half /= 2) {"),
+    ("photo.slopes[j * plane + at];\n    }\n    __syncthreads();", "photo.slopes[j * plane + at];\n    }"),
+    ("rows[j][i] = sum;\n      }\n    __syncthreads();", "rows[j][i] = sum;\n      }"),
+]
 SLIPS = [
     ("strip.ends[rank - 1] : 0, tiles, ids", "strip.ends[rank] : 0, tiles, ids"),
     ("k % box.width, y = box.y0 + k / box.width", "k / box.width, y = box.y0 + k % box.width"),
