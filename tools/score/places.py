@@ -233,7 +233,7 @@ def main() -> None:
     parser.add_argument("work", type=Path)
     parser.add_argument("--places", nargs="+", default=[], metavar="NAME", help="some of them (all)")
     parser.add_argument("--seeds", type=int, default=3, help="maps of each place (3)")
-    parser.add_argument("--masks", default="builtin", choices=("builtin", "builtin:borders", "labels", "labels_sam"))
+    parser.add_argument("--masks", default="builtin", choices=("builtin", "labels", "labels_sam"))
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
     parser.add_argument("--name", help="of the folder of maps and the JSON (that of the masks)")
     parser.add_argument("--against", type=Path, metavar="FILE", help="JSON of another run to compare with")
