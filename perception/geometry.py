@@ -1,4 +1,4 @@
-"""Rigid and similarity transforms in float64, named a_from_b; sums of rows by group."""
+"""Rigid and similarity transforms in float64, named a_from_b; sums of rows by group; order along a curve."""
 
 from __future__ import annotations
 
@@ -17,6 +17,9 @@ _TOLERANCE = 1e-4
 FAR_GAP = 20.0
 """Ratio of distances that no path of a camera leaves between two photos: those at a table lie within 2 m, the next one
 across a hall at 10."""
+
+_CELLS = 1024
+"""Cells of `along_curve` along each axis, a power of two."""
 
 
 def transform(linear: np.ndarray, shift: np.ndarray | Sequence[float]) -> np.ndarray:
@@ -138,3 +141,18 @@ def sums_by(index: np.ndarray, values: np.ndarray, count: int, weights: np.ndarr
     columns = values.reshape(len(values), math.prod(values.shape[1:])).T
     sums = [np.bincount(index, column if weights is None else weights * column, count) for column in columns]
     return np.stack(sums, axis=1).astype(np.float64, copy=False).reshape(count, *values.shape[1:])  # int64 of no values
+
+
+def along_curve(points: np.ndarray) -> np.ndarray:
+    """The order [P] int64 of points [P, 3] along a Morton curve (Morton 1966): most neighbours in space are near in it.
+
+    The sides of a cell are shares of all points, not of space, so that far points do not crowd the others.
+    """
+    code = np.zeros(len(points), np.int64)
+    for axis in range(3):
+        rank = np.empty(len(points), np.int64)
+        rank[np.argsort(points[:, axis], kind="stable")] = np.arange(len(points))
+        cell = rank * _CELLS // max(1, len(points))
+        for bit in range(_CELLS.bit_length() - 1):
+            code |= (cell >> bit & 1) << (3 * bit + axis)
+    return np.argsort(code, kind="stable")

@@ -1,11 +1,11 @@
-"""Sums by index against plain loops."""
+"""Sums by index against plain loops, order along a curve against interleaved bits."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from perception.geometry import sums_by
+from perception.geometry import along_curve, sums_by
 
 
 @pytest.mark.parametrize("shape", [(7,), (7, 3), (0,), (0, 3), (0, 2, 3)])
@@ -21,3 +21,17 @@ def test_sums_of_many_and_of_no_values(shape: tuple[int, ...], weighted: bool) -
     assert found.dtype == np.float64
     np.testing.assert_allclose(found, expected, rtol=1e-12)
     found += 0.5
+
+
+def test_points_of_a_grid_are_ordered_by_their_interleaved_bits() -> None:
+    cells = np.stack(np.meshgrid(*[np.arange(8)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    cells = np.random.default_rng(0).permutation(cells)
+    codes = ["".join(f"{z:03b}"[bit] + f"{y:03b}"[bit] + f"{x:03b}"[bit] for bit in range(3)) for x, y, z in cells]
+    found = along_curve(np.exp(cells) * [1, 10, 0.1])  # only the order along each axis counts
+    assert [codes[n] for n in found] == sorted(codes)
+    assert len(along_curve(np.zeros((0, 3)))) == 0
+
+
+def test_values_that_are_not_finite_are_ordered_too() -> None:
+    points = np.array([[np.nan, 0, np.inf], [1, 2, 3], [-np.inf, 0, 0], [1, 2, 3]])
+    assert sorted(along_curve(points)) == [0, 1, 2, 3]

@@ -170,8 +170,9 @@ def fill_holes(gaussians: Gaussians, views: list[TrainingView], room: int, seed:
     """
     generator = torch.Generator().manual_seed(seed)
     born, empty, blocks = gaussians.rows(torch.zeros(0, dtype=torch.long)), 0, 0
+    shown = gaussians
     for view in views:
-        alphas, depths = _blocks(Gaussians.concatenate([gaussians, born]), view)
+        alphas, depths = _blocks(shown, view)
         holes = alphas < EMPTY
         covered = ~holes
         if view.weight is not None:
@@ -181,6 +182,7 @@ def fill_holes(gaussians: Gaussians, views: list[TrainingView], room: int, seed:
             continue
         new = _in_holes(view, holes, covered, depths, gaussians, generator).to(gaussians.means.device)
         born = Gaussians.concatenate([born, new.rows(torch.arange(min(len(new), room - len(born))))])
+        shown = Gaussians.concatenate([gaussians, born])
     return born, empty / max(1, blocks)
 
 

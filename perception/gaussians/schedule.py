@@ -146,6 +146,7 @@ def _densify(state: TrainingState, progress: float) -> None:
         turn = round((progress - START) * config.train.iterations / config.densify.every)
         if turn % FILL_EVERY == 0:
             _fill(state, seed)
+        state.arrange()
         state.reset_statistics()
 
 

@@ -29,30 +29,29 @@ OPACITY = 0.9  # of those placed; training has little time left to strengthen th
 @dataclass(frozen=True)
 class _Seen:
     """A photo as the map shows it. labels [H, W] int; depth [H, W], 0 = none; area [M] and own [M]: pixels and
-    Gaussians of each mask, 0 for label 0."""
+    Gaussians of each mask, 0 for label 0; K [3, 3] and pose [4, 4], float64."""
 
     view: TrainingView
     labels: np.ndarray
     depth: np.ndarray
     area: np.ndarray
     own: np.ndarray
-
-    @property
-    def camera(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.view.K.double().numpy(), self.view.camera_from_world.double().numpy()
+    K: np.ndarray
+    pose: np.ndarray
 
     def shown(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Label [P] and depth z [P] of each of points [P, 3]; label 0 where the photo does not show its surface."""
-        K, pose = self.camera
-        x, y, z = ((points[:, None] * pose[:3, :3]).sum(axis=2) + pose[:3, 3]).T
+        K = self.K
+        x, y, z = (r[0] * points[:, 0] + r[1] * points[:, 1] + r[2] * points[:, 2] + r[3] for r in self.pose[:3])
         ahead = np.where(z > 1e-6, z, np.inf)
         with np.errstate(invalid="ignore"):
             column, row = K[0, 0] * x / ahead + K[0, 2], K[1, 1] * y / ahead + K[1, 2]
         height, width = self.labels.shape
-        inside = (z > 1e-6) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
-        pixel = np.where(inside, row, 0).astype(int), np.where(inside, column, 0).astype(int)
-        inside &= np.abs(self.depth[pixel] - z) < NEAR * z
-        return np.where(inside, self.labels[pixel], 0), z
+        inside = np.flatnonzero((z > 1e-6) & (column >= 0) & (row >= 0) & (column < width) & (row < height))
+        pixel, label = (row[inside].astype(int), column[inside].astype(int)), np.zeros(len(points), self.labels.dtype)
+        near = np.abs(self.depth[pixel] - z[inside]) < NEAR * z[inside]
+        label[inside] = np.where(near, self.labels[pixel], 0)
+        return label, z
 
 
 @torch.no_grad()
@@ -72,9 +71,10 @@ def for_starved_masks(gaussians: Gaussians, views: list[TrainingView], seed: int
         served = seen[k].own[mask] + (seen[k].shown(points)[0] == mask).sum()
         if served >= OWN or len(pixels) < OWN / 2:
             continue
-        K, pose = seen[k].camera
-        new = unprojected(K, pose, pixels[:, 1] + 0.5, pixels[:, 0] + 0.5, seen[k].depth[tuple(pixels.T)])
-        if any(_confirms(other, new, seen[k], int(mask)) for j, other in enumerate(seen) if j != k):
+        z = seen[k].depth[tuple(pixels.T)]
+        new = unprojected(seen[k].K, seen[k].pose, pixels[:, 1] + 0.5, pixels[:, 0] + 0.5, z)
+        pixel = float(np.median(z)) / seen[k].K[0, 0]
+        if any(_confirms(other, new, pixel, int(seen[k].area[mask])) for j, other in enumerate(seen) if j != k):
             placed.append((k, pixels))
             points = np.concatenate([points, new])
     return _made(like, seen, placed, points, seed)
@@ -86,7 +86,8 @@ def _seen(gaussians: Gaussians, view: TrainingView) -> _Seen:
     depth = surface_depth(gaussians, replace(view, depth=None))
     area = np.bincount(labels.ravel())
     area[0] = 0
-    one = _Seen(view, labels, depth, area, np.zeros(len(area), np.int64))
+    K, pose = view.K.double().numpy(), view.camera_from_world.double().numpy()
+    one = _Seen(view, labels, depth, area, np.zeros(len(area), np.int64), K, pose)
     label, z = one.shown(gaussians.means.double().numpy())
     size = gaussians.log_scales.amax(dim=1).exp().numpy() * float(view.K[0, 0]) / np.maximum(z, 1e-6)
     fits = (size <= WITHIN * np.sqrt(area[label] / np.pi)) & (gaussians.opacities.numpy() >= SOLID)
@@ -102,11 +103,15 @@ def _spread(mask: np.ndarray, depth: np.ndarray) -> np.ndarray:
     return np.stack([rows, columns], axis=1)[np.sort(first)][: 2 * WANTED]
 
 
-def _confirms(other: _Seen, points: np.ndarray, seen: _Seen, mask: int) -> bool:
-    """Whether `other` shows points [P, 3] of a mask of `seen` in one mask that is as large as it should be there."""
+def _confirms(other: _Seen, points: np.ndarray, pixel: float, area: int) -> bool:
+    """Whether `other` shows points [P, 3] of a mask in one mask that is as large as it should be there.
+
+    area: of the mask in pixels, whose side is `pixel` at its median depth, in scene units.
+    """
     label, z = other.shown(points)
-    nearer = float(np.median(seen.shown(points)[1]) / np.median(z)) * float(other.view.K[0, 0] / seen.view.K[0, 0])
-    expected = seen.area[mask] * nearer**2
+    if np.count_nonzero(label) < AGREE * len(points):
+        return False
+    expected = area * (pixel * other.K[0, 0] / float(np.median(z))) ** 2
     alike = (other.area >= max(LEAST_PIXELS, expected / ALIKE)) & (other.area <= expected * ALIKE)
     return bool((np.bincount(label, minlength=len(alike)) * alike).max() >= AGREE * len(points))
 

@@ -19,6 +19,7 @@ from perception.gaussians.losses import LabelAssignment, assign_labels
 from perception.gaussians.model import STORED, Gaussians
 from perception.gaussians.optimiser import SparseAdam
 from perception.gaussians.views import TrainingView, scene_extent
+from perception.geometry import along_curve
 from perception.progress import timed
 from perception.rasterizer.types import Gradients
 
@@ -171,6 +172,12 @@ class TrainingState:
         """Adds Gaussians with zero Adam moments."""
         self.optimiser.append(born.named())
         self._sync()
+
+    def arrange(self) -> None:
+        """Orders the Gaussians behind the held ones along a curve through space: those of a photo then lie together in
+        memory. A step of 171,000 Gaussians of a room takes 25 CPU ms instead of 35."""
+        free = along_curve(self.gaussians.means[self.held :].cpu().numpy())
+        self.keep(torch.from_numpy(np.concatenate([np.arange(self.held), self.held + free])).to(self.device))
 
     def set_degree(self, degree: int) -> None:
         """Truncates the spherical harmonics to `degree`, or adds zero coefficients up to it."""

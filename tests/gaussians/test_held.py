@@ -37,3 +37,22 @@ def test_held_rows_keep_all_but_their_colours() -> None:
         assert name == "sh" or bool(same.all()), name
     assert torch.equal(after.sh[:BEHIND], before.sh[:BEHIND])
     assert not torch.equal(after.sh[BEHIND:HELD], before.sh[BEHIND:HELD])
+
+
+def test_those_not_held_lie_along_a_curve_with_all_that_is_theirs() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (400, 3)) + np.array([0, 0, 4])
+    gaussians = from_points(points, rng.integers(0, 255, (400, 3)).astype(np.uint8), feature_dim=4, seed=0)
+    view = TrainingView("", torch.zeros(32, 48, 3, dtype=torch.uint8), None, torch.eye(3), torch.eye(4))
+    trainer = Trainer(gaussians, [view], load_config(None, []), [], held=HELD)
+    for table in (trainer.optimiser._first, trainer.optimiser._second):
+        table["means"].copy_(trainer.gaussians.means)
+    means = trainer.gaussians.means.clone()
+    trainer.arrange()
+    found = trainer.gaussians.means
+    assert torch.equal(found[:HELD], means[:HELD])
+    assert sorted(found.tolist()) == sorted(means.tolist())
+    steps = [float((rows[HELD + 1 :] - rows[HELD:-1]).norm(dim=1).mean()) for rows in (means, found)]
+    assert steps[1] < 0.4 * steps[0]  # neighbours in memory are neighbours in space
+    for table in (trainer.optimiser._first, trainer.optimiser._second):
+        assert torch.equal(table["means"], found)
