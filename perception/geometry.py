@@ -1,14 +1,17 @@
-"""Rigid and similarity transforms in float64, named a_from_b; sums of rows by group; order along a curve."""
+"""Rigid and similarity transforms in float64, named a_from_b; sums of rows by group; order along a curve; neighbours."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from perception.errors import InputError
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Camera axes: OpenGL (x right, y up, z backward) to OpenCV (x right, y down, z forward). Its own inverse."""
@@ -17,6 +20,8 @@ _TOLERANCE = 1e-4
 FAR_GAP = 20.0
 """Ratio of distances that no path of a camera leaves between two photos: those at a table lie within 2 m, the next one
 across a hall at 10."""
+AT_ONCE = 1 << 18
+"""Points whose neighbours are searched at once: a second of one core."""
 
 _CELLS = 1024
 """Cells of `along_curve` along each axis, a power of two."""
@@ -156,3 +161,13 @@ def along_curve(points: np.ndarray) -> np.ndarray:
         for bit in range(_CELLS.bit_length() - 1):
             code |= (cell >> bit & 1) << (3 * bit + axis)
     return np.argsort(code, kind="stable")
+
+
+def nearest(tree: cKDTree, points: np.ndarray, ranks: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Distances [P, R] and indices [P, R] int32 of the points of a tree nearest to each of points [P, 3], of these
+    ranks, 1 the nearest. On all cores; in pieces, between which a program can be interrupted."""
+    distance, index = np.empty((len(points), len(ranks))), np.empty((len(points), len(ranks)), np.int32)
+    for at in range(0, len(points), AT_ONCE):
+        piece = slice(at, at + AT_ONCE)
+        distance[piece], index[piece] = tree.query(points[piece], k=ranks, workers=-1)
+    return distance, index

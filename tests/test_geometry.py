@@ -1,11 +1,13 @@
-"""Sums by index against plain loops, order along a curve against interleaved bits."""
+"""Sums by index and nearest points against plain loops, order along a curve against interleaved bits."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
-from perception.geometry import along_curve, sums_by
+from perception import geometry
+from perception.geometry import along_curve, nearest, sums_by
 
 
 @pytest.mark.parametrize("shape", [(7,), (7, 3), (0,), (0, 3), (0, 2, 3)])
@@ -35,3 +37,23 @@ def test_points_of_a_grid_are_ordered_by_their_interleaved_bits() -> None:
 def test_values_that_are_not_finite_are_ordered_too() -> None:
     points = np.array([[np.nan, 0, np.inf], [1, 2, 3], [-np.inf, 0, 0], [1, 2, 3]])
     assert sorted(along_curve(points)) == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("ranks", [[1], [9], range(1, 5)])
+def test_nearest_points_are_found_in_pieces(ranks: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of all distances; no piece is larger than it may be, so that a signal need not wait for all."""
+    monkeypatch.setattr(geometry, "AT_ONCE", 7)
+    points, queries = np.random.default_rng(1).random((2, 40, 3))
+    sizes = []
+
+    class Tree:
+        def query(self, some: np.ndarray, **options: object) -> tuple[np.ndarray, np.ndarray]:
+            sizes.append(len(some))
+            return cKDTree(points).query(some, **options)
+
+    distance, index = nearest(Tree(), queries, ranks)  # type: ignore[arg-type]
+    every = np.linalg.norm(queries[:, None] - points, axis=2)
+    chosen = np.array(ranks) - 1
+    np.testing.assert_array_equal(index, np.argsort(every, axis=1)[:, chosen])
+    np.testing.assert_allclose(distance, np.sort(every, axis=1)[:, chosen], rtol=1e-12)
+    assert sizes == [7, 7, 7, 7, 7, 5]

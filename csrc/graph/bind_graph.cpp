@@ -115,7 +115,8 @@ std::size_t merge_segments(Starts mask_starts, Indices masks, Values pixels, Sta
                            Values blank, Indices view, std::size_t views, Starts near_starts, Indices near,
                            Array<const double, nb::shape<-1, -1>> z, Array<const double, nb::shape<-1>> sizes,
                            double least_share, double one_sided, double prior, double lowest,
-                           Array<std::int32_t, nb::shape<-1, 2>> children, Array<double, nb::shape<-1>> affinity) {
+                           std::size_t many, double sure, Array<std::int32_t, nb::shape<-1, 2>> children,
+                           Array<double, nb::shape<-1>> affinity) {
   require_aligned("mask_starts", mask_starts, "masks", masks, "pixels", pixels, "blank_starts", blank_starts,
                   "blank_views", blank_views, "blank", blank, "view", view, "near_starts", near_starts, "near", near,
                   "z", z, "sizes", sizes, "children", children, "affinity", affinity);
@@ -144,11 +145,14 @@ std::size_t merge_segments(Starts mask_starts, Indices masks, Values pixels, Sta
     throw nb::value_error("children and affinity must have room for a merge less than there are segments");
   }
   const perception::graph::Segments input{
-      count, all_masks, z.shape(1), {mask_starts.data(), masks.data(), pixels.data()},
+      count, all_masks, views, z.shape(1), {mask_starts.data(), masks.data(), pixels.data()},
       {blank_starts.data(), blank_views.data(), blank.data()}, view.data(), near_starts.data(), near.data(), z.data(),
-      sizes.data(), least_share, one_sided, prior, lowest};
+      sizes.data(), least_share, one_sided, prior, lowest, many, sure};
   nb::gil_scoped_release release;
-  return perception::graph::merge_segments(input, children.data(), affinity.data());
+  return perception::graph::merge_segments(input, children.data(), affinity.data(), [] {
+    nb::gil_scoped_acquire acquire;
+    if (PyErr_CheckSignals() != 0) throw nb::python_error();
+  });
 }
 
 }  // namespace
@@ -171,7 +175,8 @@ void bind_graph(nb::module_ &m) {
         nb::arg("pixels").noconvert(), nb::arg("blank_starts").noconvert(), nb::arg("blank_views").noconvert(),
         nb::arg("blank").noconvert(), nb::arg("view").noconvert(), nb::arg("views"), nb::arg("near_starts").noconvert(),
         nb::arg("near").noconvert(), nb::arg("z").noconvert(), nb::arg("sizes").noconvert(), nb::arg("least_share"),
-        nb::arg("one_sided"), nb::arg("prior"), nb::arg("lowest"), nb::arg("children").noconvert(),
+        nb::arg("one_sided"), nb::arg("prior"), nb::arg("lowest"), nb::arg("many"), nb::arg("sure"),
+        nb::arg("children").noconvert(),
         nb::arg("affinity").noconvert(),
         "Merge tree of segments by their masks; see perception.instances.consensus. Fills children and affinity and "
         "returns the number of merges.");

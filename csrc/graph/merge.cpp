@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <numeric>
 #include <utility>
 #include <vector>
 
@@ -24,10 +25,31 @@ struct Segment {
   std::vector<ViewPart> views;  // ascending
 };
 
-struct Pair {
-  std::int32_t other;
-  bool near;
-  double affinity;
+// The largest of numbers that change: a tree over them, each node with the larger of its two children.
+class Largest {
+ public:
+  explicit Largest(std::size_t count) {
+    while (leaves_ < count) leaves_ *= 2;
+    values_.assign(2 * leaves_, -1);
+  }
+
+  double operator[](std::size_t i) const { return values_[leaves_ + i]; }
+
+  void set(std::size_t i, double value) {
+    std::size_t at = leaves_ + i;
+    for (values_[at] = value; at > 1; at /= 2) values_[at / 2] = std::max(values_[at], values_[at ^ 1]);
+  }
+
+  // The first of the largest.
+  std::size_t first() const {
+    std::size_t at = 1;
+    while (at < leaves_) at = 2 * at + (values_[2 * at] < values_[2 * at + 1]);
+    return at - leaves_;
+  }
+
+ private:
+  std::size_t leaves_ = 1;
+  std::vector<double> values_;
 };
 
 // Sums the entries of two ascending lists; `key` tells their order, `add` adds the second to an equal first.
@@ -49,46 +71,73 @@ std::vector<T> merged(const std::vector<T> &a, const std::vector<T> &b, Key key,
   return out;
 }
 
+// Pairs are not held: those of a segment are found by the masks that it shares, and their affinities computed, when it
+// is merged or has lost its best partner. So memory grows with the masks' entries, not with the pairs.
 class Merger {
  public:
-  explicit Merger(const Segments &input)
+  Merger(const Segments &input, const Between &between)
       : in_(input),
+        between_(between),
         segments_(input.count),
-        rows_(input.count),
-        best_(input.count, -1),
+        holders_(input.masks),
+        near_(input.count),
+        best_(input.count),
+        partner_(input.count, kNone),
         z_(input.z, input.z + input.count * input.dims),
-        sizes_(input.sizes, input.sizes + input.count) {
-    for (std::size_t i = 0; i < in_.count; ++i) read(i);
-    find_pairs();
-    for (std::size_t i = 0; i < in_.count; ++i) best_[i] = largest(i);
+        sizes_(input.sizes, input.sizes + input.count),
+        unit_(input.masks, 0),
+        seen_(input.views, nullptr),
+        mark_(input.count, 0),
+        node_(input.count) {
+    std::iota(node_.begin(), node_.end(), 0);
+    for (std::size_t i = 0; i < in_.count; ++i) read(static_cast<std::int32_t>(i));
+    for (auto &list : near_) {
+      std::sort(list.begin(), list.end());
+      list.erase(std::unique(list.begin(), list.end()), list.end());
+    }
   }
 
-  std::size_t run(std::int32_t *children, double *affinity) {
-    std::vector<std::int32_t> node(in_.count);
-    for (std::size_t i = 0; i < in_.count; ++i) node[i] = static_cast<std::int32_t>(i);
-    std::size_t merges = 0;
-    while (!best_.empty()) {
-      const std::size_t top = std::max_element(best_.begin(), best_.end()) - best_.begin();
-      const double value = best_[top];
-      if (!(value >= in_.lowest)) break;
-      const auto &row = rows_[top];
-      const auto pair = std::find_if(row.begin(), row.end(), [&](const Pair &p) { return p.affinity == value; });
-      const std::int32_t i = std::min(static_cast<std::int32_t>(top), pair->other);
-      const std::int32_t j = std::max(static_cast<std::int32_t>(top), pair->other);
-      children[2 * merges] = node[i];
-      children[2 * merges + 1] = node[j];
-      affinity[merges++] = value;
-      merge(i, j);
-      node[i] = static_cast<std::int32_t>(in_.count + merges - 1);
+  // Merges until no affinity reaches `lowest`. children, affinity: of all merges.
+  void run(double lowest, bool neighbours_alone, std::int32_t *children, double *affinity) {
+    neighbours_alone_ = neighbours_alone;
+    for (std::size_t i = 0; i < in_.count; ++i) {
+      between_();
+      if (node_[i] != kNone) find_best(static_cast<std::int32_t>(i));
     }
-    return merges;
+    while (true) {
+      between_();
+      const auto top = static_cast<std::int32_t>(best_.first());
+      const double value = best_[top];
+      if (!(value >= lowest)) break;
+      if (partner_[top] == kNone) {
+        find_best(top);
+        continue;
+      }
+      const std::int32_t i = std::min(top, partner_[top]), j = std::max(top, partner_[top]);
+      children[2 * merges_] = node_[i];
+      children[2 * merges_ + 1] = node_[j];
+      affinity[merges_] = value;
+      merge(i, j);
+      node_[i] = static_cast<std::int32_t>(in_.count + merges_++);
+      node_[j] = kNone;
+    }
   }
+
+  std::size_t merges() const { return merges_; }
 
  private:
-  void read(std::size_t i) {
+  static constexpr std::int32_t kNone = -1;
+
+  void read(std::int32_t i) {
     Segment &s = segments_[i];
     for (auto e = in_.pixels.start[i]; e < in_.pixels.start[i + 1]; ++e) {
       if (in_.pixels.value[e] > 0) s.masks.push_back({in_.pixels.index[e], in_.pixels.value[e], 0});
+    }
+    for (const MaskPart &part : s.masks) holders_[part.mask].push_back(i);
+    for (auto e = in_.near_start[i]; e < in_.near_start[i + 1]; ++e) {
+      if (in_.near[e] == i) continue;
+      near_[i].push_back(in_.near[e]);
+      near_[in_.near[e]].push_back(i);
     }
     std::vector<ViewPart> seen, blank;
     for (const MaskPart &part : s.masks) {
@@ -128,22 +177,33 @@ class Merger {
     for (ViewPart &v : s.views) v.share /= most;
   }
 
-  // c_ijv
-  static double cosine(const Segment &a, const ViewPart &u, const Segment &b, const ViewPart &v) {
-    double sum = 0;
-    std::size_t m = u.begin, n = v.begin;
-    while (m < u.end && n < v.end) {
-      const std::int32_t x = a.masks[m].mask, y = b.masks[n].mask;
-      if (x == y) sum += a.masks[m].unit * b.masks[n].unit;
-      m += x <= y;
-      n += y <= x;
+  // Calls `use(j, a_ij)` for each segment j that is a neighbour of i or shares a mask with it.
+  template <class Use>
+  void for_pairs(std::int32_t i, Use use) {
+    constexpr char kShares = 1, kNear = 2;
+    const Segment &a = segments_[i];
+    for (const MaskPart &part : a.masks) unit_[part.mask] = part.unit;
+    for (const ViewPart &v : a.views) seen_[v.view] = &v;
+    mark_[i] = kShares;
+    std::vector<std::int32_t> others;
+    const auto add = [&](std::int32_t j, char reason) {
+      if (!mark_[j]) others.push_back(j);
+      mark_[j] |= reason;
+    };
+    for (const MaskPart &part : a.masks) {
+      if (neighbours_alone_) break;
+      for (const std::int32_t j : holders_[part.mask]) add(j, kShares);
     }
-    return sum;
+    for (const std::int32_t j : near_[i]) add(j, kNear);
+    for (const std::int32_t j : others) use(j, affinity(i, j, mark_[j] & kNear));
+    for (const std::int32_t j : others) mark_[j] = 0;
+    mark_[i] = 0;
+    for (const MaskPart &part : a.masks) unit_[part.mask] = 0;
+    for (const ViewPart &v : a.views) seen_[v.view] = nullptr;
   }
 
-  // a_ij
-  double affinity(std::size_t i, std::size_t j, bool near) const {
-    const Segment &a = segments_[i], &b = segments_[j];
+  // a_ij, where `unit_` and `seen_` hold i.
+  double affinity(std::int32_t i, std::int32_t j, bool near) const {
     double agreed = 0, weight = in_.prior;
     if (near) {
       double squares = 0;
@@ -153,63 +213,29 @@ class Merger {
       }
       agreed = in_.prior * std::max(0.0, 1 - squares);
     }
-    auto u = a.views.begin();
-    auto v = b.views.begin();
-    while (u != a.views.end() && v != b.views.end()) {
-      const std::int32_t x = u->view, y = v->view;
-      const double w = std::min(u->share, v->share);
-      if (x == y && w > in_.least_share) {
-        const double both = u->labelled * v->labelled, one = u->labelled + v->labelled - 2 * both;
-        agreed += w * both * cosine(a, *u, b, *v);
-        weight += w * (both + in_.one_sided * one);
-      }
-      u += x <= y;
-      v += y <= x;
+    const Segment &b = segments_[j];
+    for (const ViewPart &v : b.views) {
+      const ViewPart *u = seen_[v.view];
+      if (u == nullptr) continue;
+      const double w = std::min(u->share, v.share);
+      if (!(w > in_.least_share)) continue;
+      double cosine = 0;  // c_ijv
+      for (std::size_t n = v.begin; n < v.end; ++n) cosine += unit_[b.masks[n].mask] * b.masks[n].unit;
+      const double both = u->labelled * v.labelled, one = u->labelled + v.labelled - 2 * both;
+      agreed += w * both * cosine;
+      weight += w * (both + in_.one_sided * one);
     }
     return agreed / weight;
   }
 
-  // The pairs of segments that are neighbours or share a mask, with their affinities.
-  void find_pairs() {
-    std::vector<std::vector<std::int32_t>> holders(in_.masks), near(in_.count);
-    for (std::size_t i = 0; i < in_.count; ++i) {
-      for (const MaskPart &part : segments_[i].masks) holders[part.mask].push_back(static_cast<std::int32_t>(i));
-      for (auto e = in_.near_start[i]; e < in_.near_start[i + 1]; ++e) {
-        const std::int32_t a = static_cast<std::int32_t>(i), b = in_.near[e];
-        if (a != b) near[std::min(a, b)].push_back(std::max(a, b));
-      }
-    }
-    constexpr char kShares = 1, kNear = 2;
-    std::vector<char> mark(in_.count, 0);
-    std::vector<std::int32_t> others;
-    for (std::size_t i = 0; i < in_.count; ++i) {
-      const auto add = [&](std::int32_t j, char reason) {
-        if (!mark[j]) others.push_back(j);
-        mark[j] |= reason;
-      };
-      for (const MaskPart &part : segments_[i].masks) {
-        const auto &list = holders[part.mask];
-        for (auto j = std::upper_bound(list.begin(), list.end(), static_cast<std::int32_t>(i)); j != list.end(); ++j) {
-          add(*j, kShares);
-        }
-      }
-      for (const std::int32_t j : near[i]) add(j, kNear);
-      std::sort(others.begin(), others.end());
-      for (const std::int32_t j : others) {  // in order of i, so every row is ascending
-        const bool is_near = mark[j] & kNear;
-        const double value = affinity(i, j, is_near);
-        rows_[i].push_back({j, is_near, value});
-        rows_[j].push_back({static_cast<std::int32_t>(i), is_near, value});
-        mark[j] = 0;
-      }
-      others.clear();
-    }
-  }
-
-  double largest(std::size_t i) const {
+  void find_best(std::int32_t i) {
     double value = -1;
-    for (const Pair &pair : rows_[i]) value = std::max(value, pair.affinity);
-    return value;
+    std::int32_t partner = kNone;
+    for_pairs(i, [&](std::int32_t j, double a) {
+      if (a > value || (a == value && j < partner)) value = a, partner = j;
+    });
+    best_.set(i, value);
+    partner_[i] = partner;
   }
 
   // Merges segment j into segment i < j.
@@ -221,57 +247,78 @@ class Merger {
     }
     sizes_[i] = size;
     Segment &a = segments_[i], &b = segments_[j];
+    for (const MaskPart &part : b.masks) replace(holders_[part.mask], i, j);
+    for (const std::int32_t k : near_[j]) {
+      if (k == i) continue;
+      replace(near_[k], i, j);
+      if (std::find(near_[i].begin(), near_[i].end(), k) == near_[i].end()) near_[i].push_back(k);
+    }
+    near_[i].erase(std::remove(near_[i].begin(), near_[i].end(), j), near_[i].end());
+    near_[j] = {};
     a.masks = merged(a.masks, b.masks, [](const MaskPart &p) { return p.mask; },
                      [](MaskPart &p, const MaskPart &q) { p.pixels += q.pixels; });
     a.views = joined(a.views, b.views);
     derive(a);
     b = {};
-    auto row = merged(rows_[i], rows_[j], [](const Pair &p) { return p.other; },
-                      [](Pair &p, const Pair &q) { p.near |= q.near; });
-    row.erase(std::remove_if(row.begin(), row.end(), [&](const Pair &p) { return p.other == i || p.other == j; }),
-              row.end());
-    rows_[j] = {};
-    best_[j] = best_[i] = -1;
-    for (Pair &pair : row) {
-      pair.affinity = affinity(i, pair.other, pair.near);
-      best_[i] = std::max(best_[i], pair.affinity);
-      replace(pair.other, i, j, pair);
-    }
-    rows_[i] = std::move(row);
+    best_.set(j, -1);
+    double value = -1;
+    std::int32_t partner = kNone;
+    for_pairs(i, [&](std::int32_t k, double affinity) {
+      if (affinity > value || (affinity == value && k < partner)) value = affinity, partner = k;
+      offer(k, i, j, affinity);
+    });
+    best_.set(i, value);
+    partner_[i] = partner;
   }
 
-  // In the row of k: the pairs with i and j are replaced by the one with their merged segment i.
-  void replace(std::int32_t k, std::int32_t i, std::int32_t j, const Pair &joint) {
-    auto &row = rows_[k];
-    const auto place = [&](std::int32_t other) {
-      return std::lower_bound(row.begin(), row.end(), other, [](const Pair &p, std::int32_t o) { return p.other < o; });
-    };
-    double before = -1;
-    if (const auto old = place(j); old != row.end() && old->other == j) {
-      before = old->affinity;
-      row.erase(old);
+  // Of segment k, whose affinity with segment i is new, as j was merged into i. Where its best partner was i or j and
+  // now is less, its best affinity stays as a bound of the true one, which is found when it comes first.
+  void offer(std::int32_t k, std::int32_t i, std::int32_t j, double affinity) {
+    const double before = best_[k];
+    const bool lost = partner_[k] == i || partner_[k] == j;
+    if (affinity > before || (affinity == before && (lost || i < partner_[k]))) {
+      best_.set(k, affinity);
+      partner_[k] = i;
+    } else if (lost) {
+      partner_[k] = kNone;
     }
-    const Pair pair{i, joint.near, joint.affinity};
-    if (const auto at = place(i); at != row.end() && at->other == i) {
-      before = std::max(before, at->affinity);
-      *at = pair;
+  }
+
+  // In a list of segments: j is replaced by i, unless that is there already.
+  static void replace(std::vector<std::int32_t> &list, std::int32_t i, std::int32_t j) {
+    const auto old = std::find(list.begin(), list.end(), j);
+    if (old == list.end()) return;
+    if (std::find(list.begin(), list.end(), i) == list.end()) {
+      *old = i;
     } else {
-      row.insert(at, pair);
+      *old = list.back();
+      list.pop_back();
     }
-    best_[k] = before >= best_[k] ? largest(k) : std::max(best_[k], joint.affinity);
   }
 
   const Segments &in_;
+  const Between &between_;
   std::vector<Segment> segments_;
-  std::vector<std::vector<Pair>> rows_;  // of each segment, ascending; empty once it is merged into another
-  std::vector<double> best_;             // the largest affinity of each row, -1 where there is none
+  std::vector<std::vector<std::int32_t>> holders_;  // of each mask, the segments in it
+  std::vector<std::vector<std::int32_t>> near_;     // of each segment, its neighbours
+  Largest best_;                                    // of each segment, its largest affinity, or a bound of it; -1: none
+  std::vector<std::int32_t> partner_;               // of each segment, the first with this affinity; kNone: not known
   std::vector<double> z_, sizes_;
+  std::vector<double> unit_;             // of each mask, that of the segment in `for_pairs`
+  std::vector<const ViewPart *> seen_;   // of each view, likewise
+  std::vector<char> mark_;               // of each segment, why it is a pair
+  std::vector<std::int32_t> node_;       // of each segment; kNone once it is merged into another
+  std::size_t merges_ = 0;
+  bool neighbours_alone_ = false;
 };
 
 }  // namespace
 
-std::size_t merge_segments(const Segments &segments, std::int32_t *children, double *affinity) {
-  return Merger(segments).run(children, affinity);
+std::size_t merge_segments(const Segments &segments, std::int32_t *children, double *affinity, const Between &between) {
+  Merger merger(segments, between);
+  if (segments.count > segments.many) merger.run(segments.sure, true, children, affinity);
+  merger.run(segments.lowest, false, children, affinity);
+  return merger.merges();
 }
 
 }  // namespace perception::graph

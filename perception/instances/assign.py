@@ -8,9 +8,10 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
 
+from perception.geometry import nearest
 from perception.instances.votes import MaskVotes
 
-CHUNK, ENTRIES = 20_000, 10_000_000  # Gaussians, and their affinities with all instances or 4 × weights, at once
+CHUNK, ENTRIES = 20_000, 10_000_000  # Gaussians, and their affinities with instances or 4 × weights, at once
 NEIGHBOURS = 8  # nearest voters of a Gaussian
 LEAST_AGREEMENT = 0.5  # affinity with an instance that a Gaussian may join: half of its pixels are in its masks
 MARGIN = 0.15  # affinity by which another instance must be better
@@ -25,15 +26,17 @@ def mask_shares(groups: MaskVotes) -> sparse.csr_matrix:
     return shares
 
 
-def affinities(votes: MaskVotes, shares: sparse.csr_matrix, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def affinities(votes: MaskVotes, shares: sparse.csr_matrix, rows: np.ndarray) -> tuple[sparse.csr_matrix, np.ndarray]:
     """Mean of `shares` over the pixels of each Gaussian [R, K], and its number of pixels under masks [R]."""
     pixels = votes.pixels[rows]
     total = np.asarray(pixels.sum(axis=1)).reshape(-1)
-    return (pixels @ shares.T).toarray() / np.maximum(total, 1e-12)[:, None], total
+    mean = (pixels @ shares.T).tocsr()
+    mean.data /= np.repeat(np.maximum(total, 1e-12), np.diff(mean.indptr))
+    return mean, total
 
 
 def _in_chunks(rows: np.ndarray, votes: MaskVotes, count: int) -> Iterator[np.ndarray]:
-    """Parts of rows [R] whose affinities with `count` instances are computed together."""
+    """Parts of rows [R] whose affinities, with `count` instances each, are computed together."""
     size = min(CHUNK, ENTRIES // max(1, count, 4 * votes.pixels.nnz // max(1, votes.pixels.shape[0])) + 1)
     yield from (rows[begin : begin + size] for begin in range(0, len(rows), size))
 
@@ -70,17 +73,18 @@ def reassign(
     shares = mask_shares(votes.of_groups(ids, count))
     tree = cKDTree(means[voters])
     near = min(NEIGHBOURS + 1, len(voters))
-    for rows in _in_chunks(np.flatnonzero(np.isfinite(means).all(axis=1)), votes, count):
+    holders = np.bincount(shares.indices, minlength=shares.shape[1])  # of each mask, instances that share it
+    most = min(count, int(holders[votes.pixels.indices].sum()) // len(ids))  # affinities above 0, in the mean
+    for rows in _in_chunks(np.flatnonzero(np.isfinite(means).all(axis=1)), votes, most):
         affinity, pixels = affinities(votes, shares, rows)
         neighbours = voters[tree.query(means[rows], k=near, workers=-1)[1]]
         around = ids[neighbours]
         around[neighbours == rows[:, None]] = -1  # a Gaussian is not its own neighbour
         popular, support = _mode(around)
         at, own = np.arange(len(rows)), ids[rows]
-        mine = np.where(own >= 0, affinity[at, own], 0)
-        theirs = np.where(popular >= 0, affinity[at, popular], 0)
+        mine, theirs = (np.where(of >= 0, np.asarray(affinity[at, of]).reshape(-1), 0) for of in (own, popular))
         backed = (2 * support >= near - 1) & (pixels > 0) & (theirs >= LEAST_AGREEMENT)
-        joins = backed & (own < 0) & (theirs >= affinity.max(axis=1) - MARGIN)
+        joins = backed & (own < 0) & (theirs >= affinity.max(axis=1).toarray().reshape(-1) - MARGIN)
         moves = backed & (own >= 0) & (theirs >= mine + MARGIN)
         assigned[rows] = np.where(joins | moves, popular, own)
     return assigned
@@ -99,7 +103,7 @@ def without_strays(ids: np.ndarray, means: np.ndarray, opacities: np.ndarray, mi
     near = min(NEIGHBOURS + 1, len(voters))
     if near < 2:
         return ids
-    others = voters[cKDTree(means[voters]).query(means[rows], k=near, workers=-1)[1]]
+    others = voters[nearest(cKDTree(means[voters]), means[rows], range(1, near + 1))[1]]
     row, place = np.nonzero(ids[others] == ids[rows][:, None])
     links = sparse.coo_matrix((np.ones(len(row), bool), (rows[row], others[row, place])), shape=(len(ids), len(ids)))
     piece = csgraph.connected_components(links, directed=False)[1]

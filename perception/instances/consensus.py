@@ -21,7 +21,9 @@ masks of the view. The features are a weak prior p for spatial neighbours:
     p_ij = near_ij · max(0, 1 − |z_i − z_j|²)
     a_ij = (Σ_v w both c + PRIOR p_ij) / (Σ_v w (both + ONE_SIDED one) + PRIOR)
 
-The pair with the largest a_ij is merged repeatedly. P, B and z of the merged segment are pooled (average linkage).
+The pair with the largest a_ij is merged repeatedly. P, B and z of the merged segment are pooled (average linkage). Of
+more than MANY segments, spatial neighbours are merged first, until none of their a_ij reaches SURE: the time would else
+grow with the square of the segments that a mask holds.
 Each node g of the dendrogram is the group of the leaves below it. Its agreement with the masks:
 
     IoU_gm = P_gm / (T_gv + A_m − P_gm)             T_gv with unlabelled pixels: a mask that ends at the border of an
@@ -51,6 +53,7 @@ LEAST_SHARE = 0.1  # of w_ijv; a view that shows less of a segment is ignored
 ONE_SIDED = 0.5  # weight of a view that labels only one of the two, relative to a view that labels both
 PRIOR = 0.5  # weight of the feature prior, in views
 LOWEST = 0.05  # affinity below which merging stops
+MANY, SURE = 5000, 0.7  # see above
 SUPPORT = 0.6  # IoU with a mask from which a photo supports a group
 LEAST_PIXELS = 8.0  # pixels under masks from which a view shows a group
 LARGEST_PART = 0.8  # share of the instance's pixels; a larger part is nearly the instance
@@ -69,18 +72,32 @@ class Dendrogram:
     def children_of(self, node: int) -> list[int]:
         return [] if node < self.leaves else self.children[node - self.leaves].tolist()
 
-    def leaves_of(self, node: int) -> list[int]:
+    def leaves_of(self, node: int) -> np.ndarray:
+        """Ascending."""
         nodes = [node]
         for at in nodes:  # the list grows while it is read
             nodes += self.children_of(at)
-        return sorted(at for at in nodes if at < self.leaves)
+        return np.sort([at for at in nodes if at < self.leaves])
+
+    def spans(self) -> tuple[np.ndarray, np.ndarray]:
+        """All leaves in an order [S] in which those of each node stand together, of its first child first, and where
+        they begin and end [S + R, 2]."""
+        size = np.ones(self.leaves + len(self.children), np.int64)
+        for node, (a, b) in enumerate(self.children.tolist(), start=self.leaves):
+            size[node] = size[a] + size[b]
+        begin = np.zeros(len(size), np.int64)
+        roots = np.setdiff1d(np.arange(len(size)), self.children)
+        begin[roots] = np.cumsum(size[roots]) - size[roots]
+        for node, (a, b) in reversed(list(enumerate(self.children.tolist(), start=self.leaves))):
+            begin[a], begin[b] = begin[node], begin[node] + size[a]
+        return np.argsort(begin[: self.leaves]), np.stack([begin, begin + size], axis=1)
 
 
 def dendrogram(votes: MaskVotes, prototypes: np.ndarray, sizes: np.ndarray, near: sparse.csr_matrix) -> Dendrogram:
     """Repeatedly merges the pair with the largest affinity, until none reaches LOWEST (csrc/graph/merge.cpp).
 
     votes: of the S segments; prototypes [S, D]: z; sizes [S]: Gaussian counts; near [S, S]: nonzero for spatial
-    neighbours. Only pairs that are near or share a mask have an affinity, so only these are held.
+    neighbours. Only pairs that are near or share a mask have an affinity. A signal ends it.
     """
     count = len(sizes)
     if count == 0:
@@ -91,7 +108,7 @@ def dendrogram(votes: MaskVotes, prototypes: np.ndarray, sizes: np.ndarray, near
     z, weights = np.ascontiguousarray(prototypes, np.float64), np.ascontiguousarray(sizes, np.float64)
     merges = _core.merge_segments(
         *(*rows[0], values[0], *rows[1], values[1], votes.view.astype(np.int32), votes.void.shape[1], *rows[2]),
-        *(z, weights, LEAST_SHARE, ONE_SIDED, PRIOR, LOWEST, children, affinity),
+        *(z, weights, LEAST_SHARE, ONE_SIDED, PRIOR, LOWEST, MANY, SURE, children, affinity),
     )
     return Dendrogram(count, children[:merges].astype(np.int64), affinity[:merges])
 
@@ -133,9 +150,8 @@ def evidence(votes: MaskVotes) -> Evidence:
 
 def node_evidence(tree: Dendrogram, votes: MaskVotes) -> Evidence:
     """Evidence of all nodes of a dendrogram, from the votes of its leaves."""
-    leaves = [np.array([leaf], np.int32) for leaf in range(tree.leaves)]
-    for a, b in tree.children.tolist():
-        leaves.append(np.concatenate([leaves[a], leaves[b]]))
+    order, spans = tree.spans()
+    leaves = [order[begin:end] for begin, end in spans.tolist()]
     some = min(AT_ONCE, ENTRIES // max(1, len(votes.area)) + 1)
     parts = [evidence(votes.pooled(leaves[at : at + some])) for at in range(0, len(leaves), some)]
     pixels, matched, views = (
@@ -161,17 +177,25 @@ def best_cut(tree: Dendrogram, matched: np.ndarray) -> list[int]:
     return sorted(chosen)
 
 
-def parts_of(tree: Dendrogram, instance: int, seen: Evidence) -> list[int]:
-    """Highest nodes below an instance that PART_VIEWS or more photos support, with a larger IoU than the instance's.
-
-    A part fills at most LARGEST_PART of the pixels of the instance.
-    """
-    parts, nodes = [], tree.children_of(instance)
-    for node in nodes:
-        fit, fit_of_instance = seen.fit[[node, instance]].toarray()
-        supported = (fit >= SUPPORT) & (fit > fit_of_instance)
-        if supported.sum() >= PART_VIEWS and seen.pixels[node] <= LARGEST_PART * seen.pixels[instance]:
-            parts.append(node)
-        else:
-            nodes += tree.children_of(node)
-    return sorted(parts)
+def parts_of(tree: Dendrogram, instances: list[int], seen: Evidence) -> list[tuple[int, int]]:
+    """(number of the instance, node): the highest nodes below each of `instances` that PART_VIEWS or more photos
+    support, with a larger IoU than the instance's. A part fills at most LARGEST_PART of the pixels of the instance."""
+    owner = np.full(len(seen.pixels), -1)
+    owner[instances] = np.arange(len(instances))
+    for node in range(len(owner) - 1, tree.leaves - 1, -1):
+        if owner[node] >= 0:
+            owner[tree.children[node - tree.leaves]] = owner[node]
+    below = np.flatnonzero(owner >= 0)
+    whole = np.asarray(instances)[owner[below]]
+    better = (seen.fit[below] > seen.fit[whole]).multiply(seen.fit[below] >= SUPPORT)
+    good = np.asarray(better.sum(axis=1)).reshape(-1) >= PART_VIEWS
+    good &= seen.pixels[below] <= LARGEST_PART * seen.pixels[whole]
+    is_part = np.zeros(len(owner), bool)
+    is_part[below[good]] = True
+    found = []
+    for number, instance in enumerate(instances):
+        nodes = tree.children_of(instance)
+        for node in nodes:
+            nodes += [] if is_part[node] else tree.children_of(node)
+        found += [(number, node) for node in sorted(nodes) if is_part[node]]
+    return found

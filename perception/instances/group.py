@@ -108,12 +108,14 @@ def _by_consensus(
     return_free_memory()  # tables grow with the photos; without this, those of each step lie beside the next one's
     seen = node_evidence(tree, segment_votes)
     return_free_memory()
-    instance, part, parents = np.full(tree.leaves, -1), np.full(tree.leaves, -1), list[int]()  # of segments
-    for number, node in enumerate(best_cut(tree, seen.matched)):
+    instance, part = np.full(tree.leaves, -1), np.full(tree.leaves, -1)  # of segments
+    cut = best_cut(tree, seen.matched)
+    for number, node in enumerate(cut):
         instance[tree.leaves_of(node)] = number
-        for below in parts_of(tree, node, seen):
-            part[tree.leaves_of(below)] = len(parents)
-            parents.append(number)
+    below = parts_of(tree, cut, seen)
+    for number, (_, node) in enumerate(below):
+        part[tree.leaves_of(node)] = number
+    parents = [number for number, _ in below]
     ids[solid], parts[solid] = instance[segments], part[segments]
     return ids, parts, np.array(parents, np.int64)
 

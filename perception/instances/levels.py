@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from perception.geometry import nearest
 from perception.instances.assign import reassign
 from perception.instances.cluster import MIN_OPACITY
 from perception.instances.consensus import LARGEST_PART
@@ -42,7 +43,7 @@ def with_levels(grouping: Grouping, means: np.ndarray, votes: MaskVotes, cuts: S
     rows = np.flatnonzero((grouping.ids >= 0) & np.isfinite(means).all(axis=1))
     if not len(rows) or len(cuts.probability) < 2:
         return grouping
-    voxel = cKDTree(cuts.points).query(means[rows], workers=-1)[1]
+    voxel = nearest(cKDTree(cuts.points), means[rows], [1])[1][:, 0]
     both = np.zeros((grouping.count, len(cuts.probability)))
     np.add.at(both, (grouping.ids[rows], cuts.segment[voxel]), 1)
     sizes, own = both.sum(axis=1), both[:, 1:].argmax(axis=1) + 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import sparse
 
-from perception.geometry import sums_by
+from perception.geometry import AT_ONCE, nearest, sums_by
 
 ROUNDS = 12  # iterations of Lloyd's algorithm; groups are merged later, so convergence is not needed
 SAMPLE = 50_000  # rows from which the centres are computed; all rows are then assigned to the nearest centre
@@ -62,9 +62,13 @@ def touching(means: np.ndarray, groups: np.ndarray, count: int) -> sparse.csr_ma
     k = min(8, len(means))
     if k < 2:
         return sparse.csr_matrix((count, count), dtype=bool)
-    distance, neighbour = cKDTree(means).query(means, k=k, workers=-1)
-    reach = 3 * np.maximum(distance[:, 1:2], np.median(distance[:, 1]))
-    row, column = np.nonzero(distance[:, 1:] <= reach)
-    a, b = groups[row], groups[neighbour[row, column + 1]]
-    pairs = sparse.csr_matrix((np.ones((a != b).sum(), np.int64), (a[a != b], b[a != b])), shape=(count, count))
+    distance, neighbour = nearest(cKDTree(means), means, range(1, k + 1))
+    typical, pairs = np.median(distance[:, 1]), sparse.csr_matrix((count, count), dtype=np.int64)
+    for at in range(0, len(means), AT_ONCE):
+        piece = slice(at, at + AT_ONCE)
+        reach = 3 * np.maximum(distance[piece, 1:2], typical)
+        row, column = np.nonzero(distance[piece, 1:] <= reach)
+        a, b = groups[piece][row], groups[neighbour[piece][row, column + 1]]
+        apart = a != b
+        pairs += sparse.csr_matrix((np.ones(apart.sum(), np.int64), (a[apart], b[apart])), shape=(count, count))
     return (pairs + pairs.T >= 3).tocsr()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from perception.geometry import nearest
 from perception.splats.read import PARKED, Splat
 
 OPAQUE = 0.3
@@ -27,8 +28,7 @@ def floaters(splat: Splat) -> np.ndarray:
     opaque = np.flatnonzero((splat.opacity_logits > np.log(OPAQUE / (1 - OPAQUE))) & ~splat.parked)
     if len(opaque) <= NEIGHBOURS:
         return splat.parked.copy()
-    tree = cKDTree(splat.means[opaque])
-    distance = tree.query(splat.means, NEIGHBOURS + 1, workers=-1)[0][:, NEIGHBOURS].astype(np.float32)
+    distance = nearest(cKDTree(splat.means[opaque]), splat.means, [NEIGHBOURS + 1])[0][:, 0].astype(np.float32)
     sigma = np.exp(splat.log_scales.max(axis=1))
     own = np.minimum(sigma, LARGEST * np.median(sigma[opaque]))
     return np.asarray(splat.parked | (distance > np.maximum(APART * own, ALONE * np.median(distance[opaque]))))

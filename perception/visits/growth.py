@@ -96,7 +96,7 @@ def joined_instances(votes: MaskVotes, ids: np.ndarray, rows: np.ndarray) -> np.
     joined = np.full(len(rows), -1, np.int32)
     if count == 0 or len(rows) == 0:
         return joined
-    affinity, _ = affinities(votes, mask_shares(votes.of_groups(ids, count)), rows)
+    affinity = affinities(votes, mask_shares(votes.of_groups(ids, count)), rows)[0].toarray()
     best = affinity.argmax(axis=1)
     good = affinity[np.arange(len(rows)), best] >= LEAST_AGREEMENT
     joined[good] = best[good]

@@ -2,12 +2,31 @@
 
 from __future__ import annotations
 
+import ctypes
+import signal
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy import sparse
 
-from perception.instances.consensus import LEAST_SHARE, LOWEST, ONE_SIDED, PRIOR, dendrogram, evidence, node_evidence
+from perception import _core
+from perception.instances import consensus
+from perception.instances.consensus import (
+    LARGEST_PART,
+    LEAST_SHARE,
+    LOWEST,
+    ONE_SIDED,
+    PART_VIEWS,
+    PRIOR,
+    SUPPORT,
+    dendrogram,
+    evidence,
+    node_evidence,
+    parts_of,
+)
 from perception.instances.votes import MaskVotes
+from perception.interrupts import handled
 
 
 def a_table(seed: int, segments: int, views: int, filled: float = 0.5) -> MaskVotes:
@@ -39,9 +58,10 @@ def affinity(table: MaskVotes, z: np.ndarray, near: np.ndarray, i: int, j: int) 
 
 
 def merged_by_hand(
-    table: MaskVotes, z: np.ndarray, sizes: np.ndarray, near: np.ndarray
+    table: MaskVotes, z: np.ndarray, sizes: np.ndarray, near: np.ndarray, sure: float
 ) -> tuple[list[tuple[int, int]], list[float]]:
-    """Nodes and affinities of all merges: every pair anew after each, on pooled dense tables."""
+    """Nodes and affinities of all merges: every pair anew after each, on pooled dense tables. Before all others those
+    of neighbours whose affinity reaches `sure`."""
     P, B = (a.toarray().astype(np.float64) for a in (table.pixels, table.void))
     z, sizes, near, node = z.copy(), sizes.astype(float), near.copy(), list(range(len(z)))
     children, values = [], []
@@ -49,7 +69,9 @@ def merged_by_hand(
         pooled = MaskVotes(sparse.csr_matrix(P), sparse.csr_matrix(B), table.view, table.area)
         pairs = [(i, j) for i in range(len(node)) for j in range(i + 1, len(node))]
         found = [affinity(pooled, z, near, i, j) for i, j in pairs]
-        best = int(np.argmax(found))
+        close = [value if near[pair] else -1.0 for value, pair in zip(found, pairs, strict=True)]
+        sure = sure if max(close) >= sure else np.inf  # not again
+        best = int(np.argmax(found if sure == np.inf else close))
         if found[best] < LOWEST:
             break
         i, j = pairs[best]
@@ -68,18 +90,39 @@ def merged_by_hand(
     return children, values
 
 
+@pytest.mark.parametrize("sure", [np.inf, 0.5])
 @pytest.mark.parametrize(("seed", "filled"), [(0, 0.5), (1, 0.5), (2, 0.15), (3, 0.15), (4, 0.05), (5, 0.0)])
-def test_merges_are_those_of_a_dense_search_in_float64(seed: int, filled: float) -> None:
-    """Also where few pairs share a mask, and where none does and features alone join neighbours."""
+def test_merges_are_those_of_a_dense_search_in_float64(
+    seed: int, filled: float, sure: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where few pairs share a mask, where none does and features alone join neighbours, and of many segments,
+    whose sure neighbours are merged first."""
+    monkeypatch.setattr(consensus, "MANY", 100 if sure == np.inf else 11)
+    monkeypatch.setattr(consensus, "SURE", 0.5)
     table, rng = a_table(seed, 12, 5, filled), np.random.default_rng(seed)
     z, near = rng.normal(0, 0.3, (12, 3)), rng.random((12, 12)) < 0.2
     near |= near.T
     np.fill_diagonal(near, False)
     sizes = rng.integers(1, 50, 12)
-    children, values = merged_by_hand(table, z, sizes, near)
+    children, values = merged_by_hand(table, z, sizes, near, sure)
     tree = dendrogram(table, z, sizes, sparse.csr_matrix(near))
     assert [tuple(pair) for pair in tree.children.tolist()] == children and len(children) > 3
     np.testing.assert_allclose(tree.affinity, values, rtol=1e-6)
+
+
+def test_a_signal_ends_merging_between_two_segments(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The signal is pending when the compiled function begins: no bytecode, where Python would handle it, lies between
+    two calls of `map`. Nothing was merged when the handler was called."""
+    given: list[tuple] = []
+    monkeypatch.setattr(_core, "merge_segments", lambda *arguments: given.append(arguments) or 0)
+    dendrogram(a_table(0, 6, 2), np.zeros((6, 2)), np.ones(6), sparse.csr_matrix(np.ones((6, 6), bool)))
+    monkeypatch.undo()
+    (arguments,) = given
+    signalled = partial(ctypes.pythonapi.PyErr_SetInterruptEx, int(signal.SIGTERM))
+    with handled(signal.default_int_handler, signal.SIGTERM), pytest.raises(KeyboardInterrupt):
+        list(map(partial.__call__, [signalled, partial(_core.merge_segments, *arguments)]))
+    assert not arguments[-2].any()  # children
+    assert _core.merge_segments(*arguments) == 5 and arguments[-2].any()
 
 
 def test_of_equal_affinities_the_first_pair_is_merged() -> None:
@@ -125,3 +168,28 @@ def test_evidence_of_a_node_is_that_of_its_leaves_together() -> None:
         assert found.matched[node] == pytest.approx(alone.matched[0], rel=1e-5)
         assert found.pixels[node] == pytest.approx(alone.pixels[0], rel=1e-5)
         assert (found.views[node], found.support[node]) == (alone.views[0], alone.support[0])
+
+
+def test_parts_are_the_highest_nodes_that_photos_support() -> None:
+    """By the definition, node by node on dense tables; instances are nodes of several heights."""
+    found = []
+    for seed in range(6):
+        table = a_table(seed, 12, 6, 0.12)
+        tree = dendrogram(table, np.zeros((12, 2)), np.ones(12), sparse.csr_matrix(np.ones((12, 12), bool)))
+        seen = node_evidence(tree, table)
+        fit, members = seen.fit.toarray(), [set(tree.leaves_of(node)) for node in range(12 + len(tree.children))]
+        top = range(len(members) - 3, len(members))
+        instances = [n for n in top if not any(members[n] < members[m] for m in top)]
+        expected = []
+        for number, instance in enumerate(instances):
+            good = [
+                node
+                for node in range(len(members))
+                if members[node] < members[instance]
+                and ((fit[node] >= SUPPORT) & (fit[node] > fit[instance])).sum() >= PART_VIEWS
+                and seen.pixels[node] <= LARGEST_PART * seen.pixels[instance]
+            ]
+            expected += [(number, n) for n in good if not any(members[n] < members[m] for m in good)]
+        assert parts_of(tree, instances, seen) == expected
+        found += expected
+    assert len(found) > 3

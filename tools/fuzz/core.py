@@ -248,8 +248,8 @@ def _merge_segments(dice: Dice) -> Call:
         "blank": blank.data.astype(np.float32), "view": np.sort(rng.integers(0, views, masks)).astype(np.int32),
         "views": views, "near_starts": near.indptr.astype(np.int64), "near": near.indices,
         "z": rng.normal(size=(count, dice.pick((3, 1)))), "sizes": np.ones(count), "least_share": 0.1,
-        "one_sided": 0.5, "prior": 0.5, "lowest": 0.05, "children": guarded((count - 1, 2), np.int32),
-        "affinity": guarded((count - 1,), np.float64),
+        "one_sided": 0.5, "prior": 0.5, "lowest": 0.05, "many": dice.pick((100, 3)), "sure": 0.3,
+        "children": guarded((count - 1, 2), np.int32), "affinity": guarded((count - 1,), np.float64),
     }  # fmt: skip
 
 
