@@ -143,6 +143,26 @@ class TrainingObserver:
         )
 
 
+class FeatureCheckpoints:
+    """The checkpoints in folder `work` of a training of features alone (see `splats.features.Checkpoints`).
+
+    mark: see `training_mark`. masks: identity of the masks' source; with others, features are trained anew.
+    """
+
+    def __init__(self, work: Path, mark: str, masks: str):
+        self.file, self.mark, self.masks = work / CHECKPOINT, mark, masks
+        self.saved = time.monotonic()
+
+    def load(self) -> dict[str, Any] | None:
+        held = load_checkpoint(self.file, self.mark)
+        return None if held is None or held["masks"] != self.masks else held["features"]
+
+    def save(self, state: dict[str, Any], at_once: bool = False) -> None:
+        if at_once or time.monotonic() - self.saved > CHECKPOINT_SECONDS:
+            save_checkpoint(self.file, {"masks": self.masks, "features": state}, self.mark)
+            self.saved = time.monotonic()
+
+
 def save_checkpoint(path: Path, state: dict[str, Any], mark: str) -> None:
     """Writes `state` with the fingerprint `mark` of its settings, atomically."""
     import torch

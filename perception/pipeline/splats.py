@@ -15,7 +15,7 @@ from perception.gaussians.model import Gaussians, Nearby
 from perception.gaussians.views import surface_depth
 from perception.machine import require_memory, return_free_memory
 from perception.masks import MaskSource
-from perception.pipeline.checkpoint import frames_folder
+from perception.pipeline.checkpoint import FeatureCheckpoints, frames_folder
 from perception.pipeline.optimise import Optimised, Photos, Run, label_by_tasks, label_photos
 from perception.sfm.options import ReadOptions
 from perception.splats.features import new_features, train_features
@@ -60,7 +60,8 @@ class SplatInput:
         photos, report = label_photos(run, photos, source, partial(surface_depth, gaussians))
         return_free_memory()
         with run.stage("train"):
-            record = train_features(gaussians, photos.views, run.config, run.progress)
+            kept = FeatureCheckpoints(run.work, run.mark, source.identity)
+            record = train_features(gaussians, photos.views, run.config, run.progress, kept)
         return_free_memory()
         return Optimised(Nearby(gaussians), photos, record, report)
 
