@@ -36,51 +36,74 @@ def mapped(room: Path, output: Path, *more: str) -> int:
     return main(["map", str(room), "-o", str(output), *OPTIONS, *more])
 
 
-def stop_at(step: int, patch: pytest.MonkeyPatch) -> None:
-    """The command is interrupted after so many steps of features."""
+def stop_at(where: tuple[str, int], patch: pytest.MonkeyPatch) -> None:
+    """The command is interrupted when so many steps of a stage are done."""
     show = Progress.update
 
     def update(self: Progress, stage: str, done: int, total: int, *words: str) -> None:
         show(self, stage, done, total, *words)
-        if (stage, done) == ("features", step):
+        if (stage, done) == where:
             raise KeyboardInterrupt
 
     patch.setattr(Progress, "update", update)
 
 
-@pytest.mark.parametrize("killed", [False, True])
-def test_a_run_stopped_in_features_goes_on_to_the_same_map(
-    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed: bool
-) -> None:
-    """killed: without the last words of an interrupted program, so that the latest checkpoint is three steps old."""
-    whole, cut = tmp_path / "whole.gsmap", tmp_path / "cut.gsmap"
-    assert mapped(room, whole) == 0
-    with monkeypatch.context() as patch:
-        stop_at(13, patch)
-        if killed:
-            save = FeatureCheckpoints.save
-            patch.setattr(checkpoint, "CHECKPOINT_SECONDS", -1.0)
-            patch.setattr(
-                FeatureCheckpoints,
-                "save",
-                lambda self, state, at_once=False: state["record"]["iterations"] <= 10 and save(self, state, at_once),
-            )
-        assert mapped(room, cut) == 130
-    assert (tmp_path / "cut.gsmap.work" / CHECKPOINT).is_file()
+@pytest.fixture(scope="module")
+def whole(room: Path) -> Path:
+    """The map of a run without a stop."""
+    output = room.with_name("whole.gsmap")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cameras, "MOST_VIEWS", 8)
+        patch.setattr(panoramas, "PLACES", 60)
+        assert mapped(room, output) == 0
+    return output
+
+
+def gone_on(room: Path, cut: Path, whole: Path, patch: pytest.MonkeyPatch) -> int:
+    """Goes on with a run that was stopped, to the same map; the steps of features that it took."""
+    assert (cut.with_name("cut.gsmap.work") / CHECKPOINT).is_file()
     steps, train = list[int](), features.instance_loss
-    monkeypatch.setattr(features, "instance_loss", lambda *a, **k: steps.append(1) or train(*a, **k))
+    patch.setattr(features, "instance_loss", lambda *a, **k: steps.append(1) or train(*a, **k))
     assert mapped(room, cut, "--resume") == 0
-    assert len(steps) == 28 - (10 if killed else 13)
     for name in ("gaussians.ply", "features.npy", "instance_ids.npy", "membership.npy", "instances.json"):
         assert (cut / name).read_bytes() == (whole / name).read_bytes(), name
-    assert not (tmp_path / "cut.gsmap.work").exists()
+    assert not cut.with_name("cut.gsmap.work").exists()
+    return len(steps)
+
+
+@pytest.mark.parametrize(("where", "left"), [(("features", 13), 15), (("mask votes", 4), 0), (("silhouettes", 3), 0)])
+def test_a_run_that_was_interrupted_goes_on_where_it_was(
+    room: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: tuple[str, int], left: int
+) -> None:
+    cut = tmp_path / "cut.gsmap"
+    with monkeypatch.context() as patch:
+        stop_at(where, patch)
+        assert mapped(room, cut) == 130
+    assert gone_on(room, cut, whole, monkeypatch) == left
+
+
+def test_a_run_that_was_killed_goes_on_from_its_last_checkpoint(
+    room: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It had no time for one at its end: its last is three steps old."""
+    cut, save = tmp_path / "cut.gsmap", FeatureCheckpoints.save
+    with monkeypatch.context() as patch:
+        stop_at(("features", 13), patch)
+        patch.setattr(checkpoint, "CHECKPOINT_SECONDS", -1.0)
+        patch.setattr(
+            FeatureCheckpoints,
+            "save",
+            lambda self, state, at_once=False: state["record"]["iterations"] <= 10 and save(self, state, at_once),
+        )
+        assert mapped(room, cut) == 130
+    assert gone_on(room, cut, whole, monkeypatch) == 18
 
 
 def test_other_masks_train_features_anew(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The map is that of these masks alone."""
     cut, fresh = tmp_path / "cut.gsmap", tmp_path / "fresh.gsmap"
     with monkeypatch.context() as patch:
-        stop_at(13, patch)
+        stop_at(("features", 13), patch)
         assert mapped(room, cut) == 130
     labels = tmp_path / "labels"
     for photo in sorted((tmp_path / "cut.gsmap.frames").rglob("*.png")):
