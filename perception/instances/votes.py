@@ -8,7 +8,7 @@ the mask. One backward pass computes BLOCK masks for all Gaussians.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from perception.rasterizer.types import Cotangents, Gradients, Settings
 
 BLOCK = 16  # masks per pass: a feature width that the kernel is specialised for
 TRIM = 16  # views between which freed memory is returned: the kept votes split what one view's arrays filled
+FEW = 0.25  # share of the Gaussians; a view of fewer is rendered of these alone
 FAINTEST = 0.02  # pixels; smaller weights are dropped to keep the matrix sparse
 
 
@@ -148,12 +149,16 @@ def _of_view(nearby: Nearby, view: TrainingView) -> tuple[sparse.csc_matrix, np.
     labels = torch.from_numpy(dense.reshape(-1)[:-1].reshape(height, width))
     masks = range(len(names))
     gaussians, rows = nearby.of(view.name)
-    device = gaussians.means.device
+    device, camera = gaussians.means.device, (view.camera_from_world, view.K)
     rasterizer = rasterizer_for(device)
-    inputs = gaussians.inputs(view.camera_from_world, view.K, torch.zeros(len(gaussians), BLOCK, device=device))
     settings = Settings(width, height, variance=False, depth=False, eps2d=view.eps2d)
-    forward = rasterizer.rasterize_forward(replace(inputs, features=None), settings)
+    forward = rasterizer.rasterize_forward(gaussians.inputs(*camera), settings)
     seen = forward.visible[0].cpu().numpy().nonzero()[0]
+    if len(seen) < FEW * len(gaussians):  # a pass over all would take longer than what they show
+        gaussians, rows = gaussians.rows(torch.from_numpy(seen).to(device)), rows[seen]
+        forward = rasterizer.rasterize_forward(gaussians.inputs(*camera), settings)
+        seen = np.arange(len(seen))
+    inputs = gaussians.inputs(*camera, torch.zeros(len(gaussians), BLOCK, device=device))
     blocks: list[tuple[np.ndarray, ...]] = []
     for first in range(0, len(masks), BLOCK):
         block = masks[first : first + BLOCK]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from copy import copy
 from dataclasses import dataclass, field
 from typing import Any
@@ -151,15 +152,23 @@ def _entries(grouped: Grouping, gaussians: Gaussians, seen: list[Silhouettes]) -
         views[view.shown] += 1
     points, weights = (t.detach().numpy().astype(np.float64) for t in (gaussians.means, gaussians.opacities))
 
-    def entry(number: int, ids: np.ndarray, score: float, shown: int) -> dict[str, Any]:
-        return instance_entry(number, points[ids == number], weights[ids == number], score, shown)
+    def entry(number: int, rows: np.ndarray, score: float, shown: int) -> dict[str, Any]:
+        return instance_entry(number, points[rows], weights[rows], score, shown)
 
-    entries = [entry(i, grouped.ids, float(grouped.scores[i]), int(views[i])) for i in range(grouped.count)]
-    for number, parent in enumerate(grouped.parents):
-        score, shown = grouped.part_scores[number], grouped.part_views[number]
-        part = entry(grouped.count + number, grouped.part_ids, score, shown)
+    parts = range(grouped.count, grouped.count + len(grouped.parents))
+    own, below = _members(grouped.ids, range(grouped.count)), _members(grouped.part_ids, parts)
+    entries = [entry(i, own[i], float(grouped.scores[i]), int(views[i])) for i in range(grouped.count)]
+    for at, (number, parent) in enumerate(zip(parts, grouped.parents, strict=True)):
+        part = entry(number, below[at], grouped.part_scores[at], grouped.part_views[at])
         entries[parent].setdefault("parts", []).append({**part, "parent": parent})
     return entries
+
+
+def _members(ids: np.ndarray, numbers: range) -> list[np.ndarray]:
+    """The rows of each of `numbers`, ascending."""
+    order = np.argsort(ids, kind="stable")
+    ends = np.searchsorted(ids[order], [*numbers, numbers.stop])
+    return [order[begin:end] for begin, end in itertools.pairwise(ends)]
 
 
 def _best_views(ids: np.ndarray, seen: list[Silhouettes], best: int) -> list[np.ndarray]:

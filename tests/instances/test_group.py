@@ -13,12 +13,13 @@ from sklearn.metrics import adjusted_rand_score
 
 pytest.importorskip("perception._core")
 from perception.config import InstanceConfig
-from perception.gaussians.model import Nearby, from_points
+from perception.gaussians.model import Gaussians, Nearby, from_points
 from perception.gaussians.views import TrainingView
 from perception.instances.assign import without_strays
 from perception.instances.group import Grouping, _without_small, group
 from perception.instances.votes import MaskVotes, beside, mask_votes
 from perception.rasterizer.rasterize import rasterize
+from perception.rasterizer.types import Gradients
 from support.blob_scenes import BlobScene, make_scene, orbit, random_scene, with_errors
 
 
@@ -65,6 +66,23 @@ def test_a_photo_votes_for_the_gaussians_near_it_as_if_there_were_no_others() ->
         np.testing.assert_array_equal(both[near, :width], getattr(of_near, name).toarray())
         assert both[:, :width].sum() == both[near, :width].sum()
         np.testing.assert_array_equal(both[:, width:], getattr(of_all, name).toarray())
+
+
+def test_what_a_photo_does_not_show_costs_it_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A building: ten times as many Gaussians stand behind the camera. The votes are the same bit for bit, and no table
+    of weights has a row for them."""
+    scene = make_scene(row(3), CODES[:3, :8], CAMERAS[:1])
+    g, views, tables = scene.gaussians, scene.views, list[int]()
+    behind = g.rows(torch.arange(len(g)).repeat(10))
+    behind.means -= 1000 * views[0].camera_from_world[2, :3]
+    expected = mask_votes(Nearby(g), views)
+    zeros = Gradients.zeros
+    monkeypatch.setattr(Gradients, "zeros", lambda *given: tables.append(len(given[0].means)) or zeros(*given))
+    found = mask_votes(Nearby(Gaussians.concatenate([behind, g])), views)
+    for name in ("pixels", "void"):
+        np.testing.assert_array_equal(getattr(found, name)[len(behind) :].toarray(), getattr(expected, name).toarray())
+        assert getattr(found, name)[: len(behind)].nnz == 0
+    assert 0 < max(tables) <= len(g)
 
 
 def test_votes_are_the_weights_with_which_gaussians_enter_the_picture() -> None:
