@@ -1,0 +1,64 @@
+"""Measures CPU seconds and peak memory of every stage of `perception map`.
+
+python tools speed.stages INPUT MAP [KEY=VALUE …]
+
+A stage is what the progress bar names, from its first step on. What comes before it and has no bar is a row of its own.
+Settings are those of `perception map --set`. A peak is that of the process up to the end of the row.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+from perception.config import load_config
+from perception.machine import peak_memory_mib
+from perception.pipeline.mapping import build_map
+from perception.progress import Progress
+
+
+class Stages(Progress):
+    """Progress that notes when a stage begins and is done. rows: its name, CPU seconds and peak MiB at its end."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rows: list[tuple[str, float, float]] = []
+        self._stage, self._begun = "", 0.0
+
+    def note(self, name: str) -> None:
+        """Ends the row `name`."""
+        now = time.process_time()
+        if self.rows and self.rows[-1][0] == name:  # a bar that was there before
+            _, seconds, _ = self.rows.pop()
+            self._begun -= seconds
+        self.rows.append((name, now - self._begun, peak_memory_mib()))
+        self._begun = now
+
+    def update(self, stage: str, done: int, total: int, *figures: str) -> None:
+        super().update(stage, done, total, *figures)
+        if stage != self._stage:
+            self.note(f"before {stage}")
+            self._stage = stage
+        if done >= total:
+            self.note(stage)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("input", type=Path)
+    parser.add_argument("map", type=Path)
+    parser.add_argument("settings", nargs="*", metavar="KEY=VALUE")
+    options = parser.parse_args()
+    stages = Stages()
+    with stages:
+        gmap = build_map(options.input, options.map, load_config(None, options.settings, "default"), progress=stages)
+        stages.note("the map is written")
+    print(f"{len(gmap)} Gaussians, {len(gmap.instances)} instances, {time.process_time():.0f} s of CPU\n")
+    print("| stage | CPU seconds | peak so far |\n|---|---|---|")
+    for name, seconds, peak in stages.rows:
+        print(f"| {name} | {seconds:.1f} | {peak / 1024:.1f} GiB |")
+
+
+if __name__ == "__main__":
+    main()
