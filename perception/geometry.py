@@ -1,4 +1,4 @@
-"""Rigid and similarity transforms in float64, named a_from_b; sums of rows by group; order along a curve; neighbours."""
+"""Transforms in float64, named a_from_b; sums of rows by group; order along a curve; nearest neighbours."""
 
 from __future__ import annotations
 

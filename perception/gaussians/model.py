@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -113,6 +114,23 @@ class Gaussians:
             features=features,
             background=None if background is None else background.to(device),
         )
+
+
+class HeldGaussians(Gaussians):
+    """Gaussians whose geometry and colours stay as they are: their activated values are computed once, not for each
+    view. Of millions, a view shows few."""
+
+    @cached_property
+    def scales(self) -> torch.Tensor:
+        return super().scales
+
+    @cached_property
+    def opacities(self) -> torch.Tensor:
+        return super().opacities
+
+    @cached_property
+    def base_colors(self) -> torch.Tensor:
+        return super().base_colors
 
 
 def as_gaussians(gmap: Map) -> Gaussians:

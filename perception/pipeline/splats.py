@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from perception.config import MapConfig
 from perception.errors import InputError
-from perception.gaussians.model import Gaussians, Nearby
+from perception.gaussians.model import Gaussians, HeldGaussians, Nearby
 from perception.gaussians.views import surface_depth
 from perception.machine import require_memory, return_free_memory
 from perception.masks import MaskSource
@@ -50,13 +51,13 @@ class SplatInput:
     def scene(self, run: Run, output: Path) -> Scene:
         """The posed scene (see `splats.scene`); its renders lie beside the map."""
         options = ReadOptions(run.work / "sfm", run.config.seed, run.progress, run.config.photos.strict)
-        drawn = self.splat, self.gaussians.to(run.device), self.hidden
+        drawn = self.splat, self._on(run.device), self.hidden
         return splat_scene(*drawn, frames_folder(output), run.config, options)
 
     def optimise(self, run: Run, training: list[View], held_out: list[View], source: MaskSource) -> Optimised:
         """Masks of the views, and features trained on them."""
         label_by_tasks(run, training, source)
-        photos, gaussians = Photos.load(run, training, held_out), self.gaussians.to(run.device)
+        photos, gaussians = Photos.load(run, training, held_out), self._on(run.device)
         photos, report = label_photos(run, photos, source, partial(surface_depth, gaussians))
         return_free_memory()
         with run.stage("train"):
@@ -64,6 +65,9 @@ class SplatInput:
             record = train_features(gaussians, photos.views, run.config, run.progress, kept)
         return_free_memory()
         return Optimised(Nearby(gaussians), photos, record, report)
+
+    def _on(self, device: torch.device) -> Gaussians:
+        return HeldGaussians(**self.gaussians.to(device).named())
 
 
 def open_splat(source: Path, config: MapConfig) -> SplatInput | None:

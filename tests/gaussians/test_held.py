@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
 from perception.config import load_config
-from perception.gaussians.model import from_points
+from perception.gaussians import model
+from perception.gaussians.model import HeldGaussians, from_points
 from perception.gaussians.train import Trainer
 from perception.gaussians.views import TrainingView
 
@@ -56,3 +58,20 @@ def test_those_not_held_lie_along_a_curve_with_all_that_is_theirs() -> None:
     assert steps[1] < 0.4 * steps[0]  # neighbours in memory are neighbours in space
     for table in (trainer.optimiser._first, trainer.optimiser._second):
         assert torch.equal(table["means"], found)
+
+
+def test_held_gaussians_are_activated_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Inputs of the second camera are those of Gaussians that may change, bit for bit; features may still change."""
+    rng = np.random.default_rng(0)
+    free = from_points(rng.random((50, 3)), rng.integers(0, 256, (50, 3), np.uint8), feature_dim=4, seed=0)
+    held, calls, activate = HeldGaussians(**free.named()), list[int](), model.sigmoid
+    monkeypatch.setattr(model, "sigmoid", lambda logits: calls.append(1) or activate(logits))
+    for shift in (0.0, 1.0):
+        pose = torch.eye(4) + shift * torch.tensor([[0, 0, 0, 1.0], [0] * 4, [0] * 4, [0] * 4])
+        inputs = held.inputs(pose, torch.eye(3), held.features)
+    assert len(calls) == 1
+    expected = free.inputs(pose, torch.eye(3), free.features)
+    for name in ("means", "quats", "scales", "opacities", "colors", "viewmats", "features"):
+        assert torch.equal(getattr(inputs, name), getattr(expected, name)), name
+    held.features += 1
+    assert torch.equal(held.inputs(pose, torch.eye(3), held.features).features, held.features)
