@@ -1,14 +1,16 @@
-"""Measures CPU seconds and peak memory of every stage of `perception map`.
+"""Measures CPU seconds and peak memory of every stage of `perception map`, and how soon a signal ends it.
 
 python tools speed.stages INPUT MAP [KEY=VALUE …]
 
 A stage is what the progress bar names, from its first step on. What comes before it and has no bar is a row of its own.
-Settings are those of `perception map --set`. A peak is that of the process up to the end of the row.
+Settings are those of `perception map --set`. A peak is that of the process up to the end of the row;
+a wait is the longest time for which a signal such as SIGTERM is not heeded, EVERY seconds or more, beside other work.
 """
 
 from __future__ import annotations
 
 import argparse
+import signal
 import time
 from pathlib import Path
 
@@ -17,23 +19,33 @@ from perception.machine import peak_memory_mib
 from perception.pipeline.mapping import build_map
 from perception.progress import Progress
 
+EVERY = 0.1
+
 
 class Stages(Progress):
-    """Progress that notes when a stage begins and is done. rows: its name, CPU seconds and peak MiB at its end."""
+    """Progress that notes when a stage begins and is done. rows: its name, CPU seconds, peak MiB at its end, and the
+    longest time in seconds between two signals that were handled."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.rows: list[tuple[str, float, float]] = []
+        self.rows: list[tuple[str, float, float, float]] = []
         self._stage, self._begun = "", 0.0
+        self._heeded, self._wait = time.monotonic(), 0.0
+        signal.signal(signal.SIGALRM, self._heed)
+        signal.setitimer(signal.ITIMER_REAL, EVERY, EVERY)
+
+    def _heed(self, *_: object) -> None:
+        now = time.monotonic()
+        self._wait, self._heeded = max(self._wait, now - self._heeded), now
 
     def note(self, name: str) -> None:
         """Ends the row `name`."""
         now = time.process_time()
         if self.rows and self.rows[-1][0] == name:  # a bar that was there before
-            _, seconds, _ = self.rows.pop()
-            self._begun -= seconds
-        self.rows.append((name, now - self._begun, peak_memory_mib()))
-        self._begun = now
+            _, seconds, _, wait = self.rows.pop()
+            self._begun, self._wait = self._begun - seconds, max(self._wait, wait)
+        self.rows.append((name, now - self._begun, peak_memory_mib(), self._wait))
+        self._begun, self._wait = now, 0.0
 
     def update(self, stage: str, done: int, total: int, *figures: str) -> None:
         super().update(stage, done, total, *figures)
@@ -54,10 +66,11 @@ def main() -> None:
     with stages:
         gmap = build_map(options.input, options.map, load_config(None, options.settings, "default"), progress=stages)
         stages.note("the map is written")
+    signal.setitimer(signal.ITIMER_REAL, 0)
     print(f"{len(gmap)} Gaussians, {len(gmap.instances)} instances, {time.process_time():.0f} s of CPU\n")
-    print("| stage | CPU seconds | peak so far |\n|---|---|---|")
-    for name, seconds, peak in stages.rows:
-        print(f"| {name} | {seconds:.1f} | {peak / 1024:.1f} GiB |")
+    print("| stage | CPU seconds | peak so far | longest wait |\n|---|---|---|---|")
+    for name, seconds, peak, wait in stages.rows:
+        print(f"| {name} | {seconds:.1f} | {peak / 1024:.1f} GiB | {wait:.1f} s |")
 
 
 if __name__ == "__main__":
