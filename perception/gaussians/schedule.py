@@ -4,6 +4,7 @@ progress   0 ─ .05 ───── .3 ─ .4 ─── .6 ──────�
 photos     half size          │ full size (small photos: from .15)
 features                 │      rendered every 3rd step (`losses.start`, `losses.every`)
 growth         densified every 100 steps, holes filled
+veils          of few photos: removed every 100 steps (see `free_space`)
 harmonics                            one more degree per trial, then unneeded degrees are removed
 rates                                              decrease to a twentieth
 
@@ -107,6 +108,7 @@ def after_step(state: TrainingState, progress: float, may_stop: bool) -> None:
     due = state.iteration % every == 0
     if due:
         _densify_and_judge(state, progress)
+        _clear_cameras(state)
     if state.iteration % (5 * every) == 0 and state.progress < 1.0:
         _add_to_curve(state, progress)
     if progress < STOP <= state.progress and state.has_labels and not state.held:  # an update adds in its own way
@@ -117,6 +119,7 @@ def after_step(state: TrainingState, progress: float, may_stop: bool) -> None:
 
 def finish(state: TrainingState) -> None:
     """Prunes and records the final quality; called once, when training is complete."""
+    _clear_cameras(state)
     _prune(state)
     _add_to_curve(state, state.progress)
 
@@ -181,6 +184,16 @@ def _place_in_masks(state: TrainingState) -> None:
             state.append(born.to(state.device))
             state.reset_statistics()
             _note(state, f"masks: {len(born)} Gaussians added in masks that had too few")
+
+
+def _clear_cameras(state: TrainingState) -> None:
+    """Removes Gaussians around the cameras where nothing was measured; with few photos, see `free_space`."""
+    if state.free_space is None:
+        return
+    veils = torch.from_numpy(state.free_space.reached_by(state.gaussians)).to(state.device)
+    if bool(veils.any()):
+        state.keep(torch.nonzero(~veils).flatten())
+        state.reset_statistics()
 
 
 def _prune(state: TrainingState) -> None:

@@ -15,6 +15,7 @@ import torch
 from perception.config import MapConfig
 from perception.gaussians.densify import Statistics
 from perception.gaussians.early_stopping import EarlyStopping
+from perception.gaussians.free_space import FreeSpace
 from perception.gaussians.losses import LabelAssignment, assign_labels
 from perception.gaussians.model import STORED, Gaussians
 from perception.gaussians.optimiser import SparseAdam
@@ -104,6 +105,8 @@ class TrainingState:
         self.complete = False  # finished, unless a longer training is requested
         self.skipped = 0.0  # share of training progress skipped by early stopping
         self.initial_count = len(gaussians)
+        by_stereo = any(view.depth is not None and not view.measured for view in views)
+        self.free_space = FreeSpace(gaussians.means.cpu().double().numpy(), views) if by_stereo else None
         self.gaussians = gaussians.to(self.device)
         self.reset_statistics()
         self.optimiser = SparseAdam(self.gaussians.named())
