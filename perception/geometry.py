@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from perception.errors import InputError
+from perception.interrupts import uninterrupted
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -169,5 +170,6 @@ def nearest(tree: cKDTree, points: np.ndarray, ranks: Sequence[int]) -> tuple[np
     distance, index = np.empty((len(points), len(ranks))), np.empty((len(points), len(ranks)), np.int32)
     for at in range(0, len(points), AT_ONCE):
         piece = slice(at, at + AT_ONCE)
-        distance[piece], index[piece] = tree.query(points[piece], k=ranks, workers=-1)
+        with uninterrupted():  # its threads would go on in memory that is freed
+            distance[piece], index[piece] = tree.query(points[piece], k=ranks, workers=-1)
     return distance, index

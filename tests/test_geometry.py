@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -57,3 +59,18 @@ def test_nearest_points_are_found_in_pieces(ranks: list[int], monkeypatch: pytes
     np.testing.assert_array_equal(index, np.argsort(every, axis=1)[:, chosen])
     np.testing.assert_allclose(distance, np.sort(every, axis=1)[:, chosen], rtol=1e-12)
     assert sizes == [7, 7, 7, 7, 7, 5]
+
+
+def test_a_signal_waits_for_the_search_that_runs() -> None:
+    """The threads of a search must not outlive it; the next piece is not begun."""
+    done = []
+
+    class Tree:
+        def query(self, some: np.ndarray, **_: object) -> tuple[np.ndarray, np.ndarray]:
+            signal.raise_signal(signal.SIGINT)
+            done.append(len(some))
+            return np.zeros((len(some), 2)), np.zeros((len(some), 2), int)
+
+    with pytest.raises(KeyboardInterrupt):
+        nearest(Tree(), np.zeros((geometry.AT_ONCE + 1, 3)), [1, 2])  # type: ignore[arg-type]
+    assert done == [geometry.AT_ONCE]

@@ -77,7 +77,7 @@ def reassign(
     most = min(count, int(holders[votes.pixels.indices].sum()) // len(ids))  # affinities above 0, in the mean
     for rows in _in_chunks(np.flatnonzero(np.isfinite(means).all(axis=1)), votes, most):
         affinity, pixels = affinities(votes, shares, rows)
-        neighbours = voters[tree.query(means[rows], k=near, workers=-1)[1]]
+        neighbours = voters[nearest(tree, means[rows], range(1, near + 1))[1]]
         around = ids[neighbours]
         around[neighbours == rows[:, None]] = -1  # a Gaussian is not its own neighbour
         popular, support = _mode(around)
