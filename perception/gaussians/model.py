@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from perception.colors import rgb_from_sh, sh_from_rgb
+from perception.geometry import nearest
 from perception.map.map import Map
 from perception.rasterizer.types import Inputs
 
@@ -150,8 +151,8 @@ def from_points(
     points = np.ascontiguousarray(points, dtype=np.float64)
     neighbours = min(4, len(points))
     if neighbours > 1:
-        distances, _ = cKDTree(points).query(points, k=neighbours, workers=-1)
-        spacing = np.sqrt(np.mean(distances[:, 1:] ** 2, axis=1))
+        distances, _ = nearest(cKDTree(points), points, range(2, neighbours + 1))
+        spacing = np.sqrt(np.mean(distances**2, axis=1))
     else:
         spacing = np.ones(len(points))
     positive = spacing[spacing > 0]

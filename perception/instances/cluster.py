@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from perception.config import InstanceConfig
+from perception.geometry import nearest
 
 NEIGHBOURS = 12
 MIN_OPACITY = 0.1
@@ -78,13 +79,13 @@ def _spread(features: np.ndarray, chosen: np.ndarray, labels: np.ndarray, sample
 
     sampled = np.zeros(len(features), bool)
     sampled[chosen] = True
-    distance, nearest = cKDTree(features[chosen]).query(features, k=samples + 1, workers=-1)
+    distance, sample = nearest(cKDTree(features[chosen]), features, range(1, samples + 2))
     core = np.where(sampled, distance[:, samples], distance[:, samples - 1])  # a sampled row finds itself first
     limit = np.zeros(labels.max() + 1)
     member = labels >= 0
     np.maximum.at(limit, labels[member], core[chosen[member]])
-    first = (labels[nearest] >= 0).argmax(axis=1)
-    source = nearest[np.arange(len(features)), first]
+    first = (labels[sample] >= 0).argmax(axis=1)
+    source = sample[np.arange(len(features)), first]
     joins = (labels[source] >= 0) & (core <= limit[labels[source]])
     return np.where(joins, labels[source], -1)
 
@@ -107,7 +108,8 @@ def split_disconnected(means: np.ndarray, scales: np.ndarray, ids: np.ndarray, s
         rows = np.flatnonzero(ids == cluster)
         if len(rows) < max(smallest, 2):
             continue
-        distance, neighbour = cKDTree(means[rows]).query(means[rows], k=min(NEIGHBOURS + 1, len(rows)), workers=-1)
+        near = range(1, min(NEIGHBOURS + 1, len(rows)) + 1)
+        distance, neighbour = nearest(cKDTree(means[rows]), means[rows], near)
         spacing = 3 * float(np.quantile(distance[:, 1], 0.95))
         reach = np.maximum(spacing, 2 * (radius[rows][:, None] + radius[rows][neighbour]))
         source, column = np.nonzero(distance <= np.minimum(reach, 4 * spacing))
