@@ -122,7 +122,7 @@ class LossConfig(Settings):
     variance_weight: float = Field(0.5, ge=0, le=1000, description="weight λ_var of the variance loss (eq. 13)")
     margin: float = Field(1.0, gt=0, le=1000, description="margin γ of L_neg (eq. 8), in units of ‖z‖²")
     depth_weight: float = Field(
-        0.5, ge=0, le=1000, description="weight of the loss of measured depth; a fifth for that of stereo; 0: no depth"
+        0.5, ge=0, le=1000, description="weight of the loss of measured depth; 0: no depth, by stereo either"
     )
     start: float = Field(0.3, ge=0, le=1, description="share of the training after which features are trained")
     every: int = Field(3, ge=1, le=10**8, description="features are trained in every N-th iteration")

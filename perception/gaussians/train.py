@@ -2,7 +2,7 @@
 
     L = L_RGB + λ_inst2d L_inst2d + λ_var L_var                                                                (eq. 14)
 
-and λ_depth L_depth where a sensor measured depth, or stereo found it.
+and λ_depth L_depth where a sensor measured depth. Depth by stereo only starts the Gaussians: held to it, they fit less.
 
 All schedules are functions of progress in [0, 1], the larger of the shares of iterations done and of time spent. A time
 limit thus shortens every phase instead of cutting off the end. Random numbers depend on (seed, iteration) only, so a
@@ -31,9 +31,6 @@ from perception.rasterizer.types import Cotangents, Forward, Gradients, Settings
 
 SSIM_WEIGHT = 0.2
 """β of the photometric loss (eq. 4), as in Kerbl et al. 2023."""
-STEREO_WEIGHT = 0.2
-"""Weight of depth found by stereo, over that of measured depth: 1 instead took
-0.7 dB of 31.0 with every 2nd photo of a fox."""
 _LEAST_RECORDS = 1 << 18
 """Gradient records that a GPU must have room for at once (see `Settings.max_records`)."""
 INSTANCE_WEIGHT = 0.1
@@ -111,7 +108,7 @@ class Trainer(TrainingState):
             sh_degree=self.gaussians.sh_degree,
             eps2d=view.eps2d,
             variance=with_features,
-            depth=view.depth is not None,
+            depth=view.measured and view.depth is not None,
             max_records=self._max_records,
         )
         rasterizer = rasterizer_for(self.device)
@@ -158,11 +155,10 @@ class Trainer(TrainingState):
         rgb = photometric(image, target_photo(view, image), SSIM_WEIGHT, view.weight)  # L_RGB, eq. 4
         total, colors = rgb.value, view.exposed(rgb.gradient)[None]
         alphas = depths = features = variance = None
-        if view.depth is not None and out.depths is not None:
+        if view.measured and view.depth is not None and out.depths is not None:
             value, depths, alphas = depth_loss(out.depths[0], out.alphas[0], view.depth)
-            trust = losses.depth_weight * (1 if view.measured else STEREO_WEIGHT)
-            total += trust * value
-            depths, alphas = trust * depths[None], trust * alphas[None]
+            total += losses.depth_weight * value
+            depths, alphas = losses.depth_weight * depths[None], losses.depth_weight * alphas[None]
         if out.features is not None and out.feature_variance is not None:
             weight = 1.0 if view.weight is None else view.weight[..., None]
             spread = out.feature_variance[0] if view.weight is None else out.feature_variance[0] * weight
