@@ -36,8 +36,9 @@ class FreeSpace:
         measured there."""
         means, scales = (tensor.cpu().double().numpy() for tensor in (gaussians.means, gaussians.scales))
         widest, found = scales.max(axis=1), np.zeros(len(means), bool)
+        x, y, z = np.ascontiguousarray(means.T)
         for center, radius in self._balls:
-            distance = np.sqrt(((means - center) ** 2).sum(axis=1))
+            distance = np.sqrt((x - center[0]) ** 2 + (y - center[1]) ** 2 + (z - center[2]) ** 2)
             near = np.flatnonzero((distance - widest < radius) & (radius > 0) & ~found)
             axes = rotation_matrices(gaussians.quats.cpu()[near]).double().numpy()
             toward = ((center - means[near])[:, :, None] * axes).sum(axis=1) / np.maximum(distance[near], 1e-9)[:, None]
