@@ -115,6 +115,9 @@ class DensifyConfig(Settings):
     grad_threshold: float = Field(
         1e-4, ge=0, description="gradient of the 2D mean from which a Gaussian grows; units of half the long side"
     )
+    absgrad: bool = Field(
+        True, description="that gradient is what each pixel adds by its size (AbsGS, Ye et al. 2024), not the plain sum"
+    )
 
 
 class LossConfig(Settings):
@@ -191,6 +194,7 @@ PAPER: dict[str, Any] = {
     "train.sh_degree": 3,
     "densify.every": 100,
     "densify.grad_threshold": 3.5e-4,
+    "densify.absgrad": False,
     "losses.feature_dim": 8,
     "losses.variance_weight": 0.5,
     "losses.margin": 1.0,

@@ -10,7 +10,7 @@ constexpr int kParts = kWarp / kGroup;              // lanes that share a splat'
 constexpr int kPixels = kWarp / kParts;             // pixels that each of them adds up
 constexpr int kPitch = kWarp + 1;                   // so that lanes of all splats and parts read from different banks
 constexpr int kChannels = 4 + NF * (1 + VARIANCE);  // red, green, blue, depth, e, e²
-constexpr int kSums = 6 + kChannels;                // of h, h u, h dy, h u², h u dy, h dy², then w times each channel
+constexpr int kSums = 8 + kChannels;  // of h, h u, h dy, h u², h u dy, h dy², |h u|, |h dy|, then w times each channel
 static_assert(kSums <= 2 * kPitch, "a splat's sums must fit where its weights stood");
 
 struct WarpMemory {
@@ -85,7 +85,8 @@ static __device__ inline void sum_pixels(const Splat &s, bool touched, const Pix
       const T dy = s.y - (p.granule_y + i / kGranuleWidth);
       const T u = fma(s.k, dy, s.x - (p.granule_x + i % kGranuleWidth)), hu = h * u, hy = h * dy;
       sums[0] += h, sums[1] += hu, sums[2] += hy, sums[3] += hu * u, sums[4] += hu * dy, sums[5] += hy * dy;
-      for (int c = 0; c < kChannels; ++c) sums[6 + c] += w * memory.cotangent[c][i];
+      sums[6] += magnitude(hu), sums[7] += magnitude(hy);
+      for (int c = 0; c < kChannels; ++c) sums[8 + c] += w * memory.cotangent[c][i];
     }
   for (int c = 0; c < kSums; ++c)
     for (int step = kGroup; step < kWarp; step *= 2) sums[c] += __shfl_xor_sync(kAllLanes, sums[c], step);
@@ -107,8 +108,8 @@ static __device__ inline bool sum_warps(const WarpMemory *warps, int j, int c, c
   return any;
 }
 
-// records [slots, kRecord], zero on entry: a splat's sums over one tile, of h, h u, h dy, h u², h u dy, h dy², w g_rgb,
-// w g_z and w times the gradient with respect to each feature.
+// records [slots, kRecord], zero on entry: a splat's sums over one tile, of h, h u, h dy, h u², h u dy, h dy², |h u|,
+// |h dy|, w g_rgb, w g_z and w times the gradient with respect to each feature.
 extern "C" __global__ void __launch_bounds__(kThreads)
     backward_kernel(Scene scene, Strip strip, Lists lists, Images images, Cotangents grad, Results records) {
   __shared__ WarpMemory warps[kWarps];

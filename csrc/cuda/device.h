@@ -24,7 +24,7 @@ using Results = GLOBAL(T);
 constexpr int kWarp = 32, kThreads = 256, kWarps = kThreads / kWarp;
 constexpr int kTile = 16;                             // pixels; a thread block works on one tile
 constexpr int kGranuleWidth = 8, kGranuleHeight = 4;  // pixels; a warp works on one granule
-constexpr int kMoments = 10;                          // numbers of a gradient record before its feature channels
+constexpr int kMoments = 12;                          // numbers of a gradient record before its feature channels
 constexpr int kRecord = kMoments + NF;
 constexpr int kFeatures = NF ? NF : 1;  // an array's least length
 constexpr int kWide = kWarp;            // with more tiles a Gaussian is worked on by a whole warp, not by one thread
@@ -90,12 +90,13 @@ struct Cotangents {
 
 // dL/d(input), added to what is there; null where not wanted. camera: [N,12] each Gaussian's dL/dR, dL/dt.
 struct Gradients {
-  Results means, quats, scales, opacities, colors, features, camera, mean2d;
+  Results means, quats, scales, opacities, colors, features, camera, mean2d, absgrad;
 };
 
 static __device__ inline T lower(T a, T b) { return a < b ? a : b; }
 static __device__ inline T higher(T a, T b) { return a > b ? a : b; }
 static __device__ inline T clamped(T x, T low, T high) { return lower(higher(x, low), high); }
+static __device__ inline T magnitude(T x) { return higher(x, -x); }
 static __device__ inline int lower(int a, int b) { return a < b ? a : b; }
 static __device__ inline int higher(int a, int b) { return a > b ? a : b; }
 

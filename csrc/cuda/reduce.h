@@ -33,7 +33,7 @@ static __device__ inline ProjectedGrad<T> picture_gradient(const Splat &s, const
   const T precision_x = s.a * (-2 / kLog2E<T>), precision_y = s.d * (-2 / kLog2E<T>);  // 1/var_x, 1/var_y
   const T gu = -r[1] * precision_x;
   ProjectedGrad<T> g;
-  g.x = gu, g.y = s.k * gu - r[2] * precision_y, g.z = r[9];
+  g.x = gu, g.y = s.k * gu - r[2] * precision_y, g.z = r[11];
   factored_vjp(T(0.5) * r[3] * precision_x * precision_x, -r[4] * precision_x,
                T(0.5) * r[5] * precision_y * precision_y, s.k, 1 / precision_y, g);
   return g;
@@ -81,10 +81,13 @@ extern "C" __global__ void __launch_bounds__(kThreads)
   T g_mean[3], g_quat[4], g_scale[3], g_camera[12];  // dL/dR, dL/dt
   project_vjp<T>(cam, scene.means + 3 * i, scene.quats + 4 * i, scene.scales + 3 * i, g, g_mean, g_quat, g_scale,
                  g_camera, g_camera + 9);
-  color_gradient(scene, cam, i, s, r + 6, out.colors, g_mean, g_camera, g_camera + 9);
+  color_gradient(scene, cam, i, s, r + 8, out.colors, g_mean, g_camera, g_camera + 9);
   const T g_opacity = r[0] / scene.opacities[i], g_mean2d[2] = {g.x, g.y};
+  const T size_x = r[6] * s.a * (-2 / kLog2E<T>), size_y = magnitude(s.k) * size_x + r[7] * s.d * (-2 / kLog2E<T>);
+  const T absolute[2] = {size_x, size_y};  // see absolute_gradient of rasterizer/reduce.cpp
   add(out.means, i, g_mean, 3), add(out.quats, i, g_quat, 4), add(out.scales, i, g_scale, 3);
   add(out.opacities, i, &g_opacity, 1), add(out.camera, i, g_camera, 12), add(out.mean2d, i, g_mean2d, 2);
+  add(out.absgrad, i, absolute, 2);
   if (out.features)
     for (int c = 0; c < NF; ++c) out.features[i * scene.dims + c] += r[kMoments + c];
 }

@@ -151,23 +151,25 @@ void load_tile(const Pass<T> &pass, const TileList &list, Slice slice, const T *
       transpose<16, BackwardTile<T, NF, VAR>::kRow>(tile.by_pixel[g][0], tile.by_channel[g][0]);
 }
 
-// The sums over pixels that one splat gathers, a lane a pixel: numbers [0..9] of its record (records.h). With (dx, dy)
+// The sums over pixels that one splat gathers, a lane a pixel: numbers [0..11] of its record (records.h). With (dx, dy)
 // from the pixel's centre to the splat's mean and u = dx + k dy (k of the splat, see Projected),
 //   ln alpha = ln opacity - (u² / var_x + dy² / var_y) / 2,
 // so the gradients of mean, var_x, k and var_y are sums of h times u, dy and their products: see picture_gradient.
 template <class T, bool DEPTH>
 struct Moments {
   Vec<T> h, hu, hy, huu, huy, hyy;  // Σ h, Σ h u, Σ h dy, Σ h u², Σ h u dy, Σ h dy²
+  Vec<T> size_u, size_y;            // Σ |h u|, Σ |h dy|
   Vec<T> rgb[3], z;                 // Σ w g of red, green, blue and depth
   Moments() {
     const Vec<T> zero(T(0));
-    h = hu = hy = huu = huy = hyy = rgb[0] = rgb[1] = rgb[2] = z = zero;
+    h = hu = hy = huu = huy = hyy = size_u = size_y = rgb[0] = rgb[1] = rgb[2] = z = zero;
   }
   void store(T *record, bool first) const {
     using V = Vec<T>;
     const V zero(T(0));
-    const V all[kGeometry] = {h, hu, hy, huu, huy, hyy, rgb[0], rgb[1], rgb[2], z, zero, zero, zero, zero, zero, zero};
-    constexpr int kUsed = DEPTH ? 10 : 9;
+    const V all[kGeometry] = {h,      hu,     hy, huu,  huy,  hyy,  size_u, size_y, rgb[0],
+                              rgb[1], rgb[2], z,  zero, zero, zero, zero};
+    constexpr int kUsed = DEPTH ? 12 : 11;
     for (int c = 0; c < kGeometry; c += V::kLanes) {
       const V s = c < kUsed ? transpose_sum(all + c) : zero;
       (first ? s : s + V::load(record + c)).store(record + c);
@@ -212,6 +214,7 @@ inline void backward_step(const Splat<T> &s, bool clamps, int g, int lane, T *pr
   if (clamps) h = keep(P(kMaxAlpha<T>) >= b.raw, h);  // a clamped alpha does not move
   const P hu = h * b.u, hy = h * b.dy;
   m.h = add(h, m.h), m.hu = add(hu, m.hu), m.hy = add(hy, m.hy);
+  m.size_u = add_size(hu, m.size_u), m.size_y = add_size(hy, m.size_y);
   m.huu = add_product(hu, b.u, m.huu), m.huy = add_product(hu, b.dy, m.huy), m.hyy = add_product(hy, b.dy, m.hyy);
   m.rgb[0] = add_product(w, red, m.rgb[0]), m.rgb[1] = add_product(w, green, m.rgb[1]);
   m.rgb[2] = add_product(w, blue, m.rgb[2]);

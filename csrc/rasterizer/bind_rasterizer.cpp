@@ -148,7 +148,7 @@ struct Cotangents {
 
 template <class T>
 struct Gradients {
-  Optional<T> means, quats, scales, opacities, colors, features, viewmats, mean2d;
+  Optional<T> means, quats, scales, opacities, colors, features, viewmats, mean2d, absgrad;
 
   perception::Gradients<T> checked_for(const perception::Inputs<T> &in, bool stored) {
     const int64_t n = in.n, c = in.cameras;
@@ -162,6 +162,7 @@ struct Gradients {
             checked("out features", features, {n, in.dims}),
             checked("out viewmats", viewmats, {c, 4, 4}),
             checked("out mean2d", mean2d, {c, n, 2}),
+            checked("out absgrad", absgrad, {c, n, 2}),
             stored};
   }
 };
@@ -262,9 +263,10 @@ void bind(nb::module_ &m, const char *suffix) {
            arg("feature_variance").none());
   nb::class_<Gradients<T>>(m, name("RasterizerGradients").c_str())
       .def(nb::init<Optional<T>, Optional<T>, Optional<T>, Optional<T>, Optional<T>, Optional<T>, Optional<T>,
-                    Optional<T>>(),
+                    Optional<T>, Optional<T>>(),
            arg("means").none(), arg("quats").none(), arg("scales").none(), arg("opacities").none(),
-           arg("colors").none(), arg("features").none(), arg("viewmats").none(), arg("mean2d").none());
+           arg("colors").none(), arg("features").none(), arg("viewmats").none(), arg("mean2d").none(),
+           arg("absgrad").none());
   m.def(name("rasterize_forward").c_str(), &forward<T>, "inputs"_a, "images"_a, arg("visible"), arg("radii").none(),
         "simd"_a);
   m.def(name("rasterize_labels").c_str(), &label<T>, "inputs"_a, "labels"_a.noconvert(), "least"_a,

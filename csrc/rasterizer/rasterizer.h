@@ -57,11 +57,11 @@ struct Cotangents {
 template <class T>
 struct Gradients {
   T *means, *quats, *scales, *opacities, *colors, *features, *viewmats;
-  T *mean2d;  // [C,N,2] px
+  T *mean2d, *absgrad;  // [C,N,2] px; absgrad: see absolute_gradient in reduce.cpp
   bool stored;
 
   bool features_alone() const {
-    return features && !(means || quats || scales || opacities || colors || viewmats || mean2d);
+    return features && !(means || quats || scales || opacities || colors || viewmats || mean2d || absgrad);
   }
 };
 

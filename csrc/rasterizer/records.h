@@ -5,8 +5,9 @@
 
 namespace perception {
 
-// [0] Σ h, [1] Σ h u, [2] Σ h dy, [3] Σ h u², [4] Σ h u dy, [5] Σ h dy², [6..8] Σ w g of red, green and blue, [9] Σ w g
-// of depth, then from kGeometry on dL/df for every feature channel. Sums over the pixels; backward.cpp has the symbols.
+// [0] Σ h, [1] Σ h u, [2] Σ h dy, [3] Σ h u², [4] Σ h u dy, [5] Σ h dy², [6] Σ |h u|, [7] Σ |h dy|, [8..10] Σ w g of
+// red, green and blue, [11] Σ w g of depth, then from kGeometry on dL/df for every feature channel. Sums over the pixels;
+// backward.cpp has the symbols.
 constexpr int kGeometry = 16;
 
 // Tiles [begin, end), in row-major order.

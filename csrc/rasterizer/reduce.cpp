@@ -1,5 +1,7 @@
 // Stage 6: sums every splat's records in a fixed order and takes the gradient from the picture plane back to the
 // Gaussian's own parameters and the camera.
+#include <cmath>
+
 #include "constants.h"
 #include "kernels.h"
 #include "records.h"
@@ -26,6 +28,7 @@ template <class T>
 struct GradientBlock {
   alignas(64) T in[10][kBlock];      // mean [3], quaternion [4], scales [3]
   alignas(64) T picture[6][kBlock];  // dL/d(x, y, z, cov_xx, cov_xy, cov_yy)
+  T absolute[2][kBlock];             // Σ |dL/d(x, y)|, see absolute_gradient
   alignas(64) T out[10][kBlock];     // dL/d(in)
   alignas(64) T camera[12][kBlock];  // dL/dR [9], dL/dt [3]
   uint32_t splat[kBlock];            // index into Frame::splats
@@ -73,10 +76,17 @@ ProjectedGrad<T> picture_gradient(const Splat<T> &s, const T *r) {
   const T precision_x = s.a * (-2 / kLog2E<T>), precision_y = s.d * (-2 / kLog2E<T>);  // 1/var_x, 1/var_y
   const T gu = -r[1] * precision_x;  // dL/dx
   ProjectedGrad<T> g;
-  g.x = gu, g.y = s.k * gu - r[2] * precision_y, g.z = r[9];
+  g.x = gu, g.y = s.k * gu - r[2] * precision_y, g.z = r[11];
   factored_vjp(T(0.5) * r[3] * precision_x * precision_x, -r[4] * precision_x,
                T(0.5) * r[5] * precision_y * precision_y, s.k, 1 / precision_y, g);
   return g;
+}
+
+// Σ over the pixels of the size of what each adds to dL/d(x, y): those that pull in opposite ways do not cancel (AbsGS,
+// Ye et al. 2024). The two terms of dL/dy are taken by their sizes too, and so are slices of the feature channels.
+template <class T>
+void absolute_gradient(const Splat<T> &s, const T *r, T &x, T &y) {
+  x = r[6] * s.a * (-2 / kLog2E<T>), y = std::abs(s.k) * x + r[7] * s.d * (-2 / kLog2E<T>);
 }
 
 template <class T>
@@ -128,8 +138,11 @@ void flush_block(const Pass<T> &pass, const T (*colors)[3], const Gradients<T> &
     if (out.scales)
       for (int c = 0; c < 3; ++c)
         put(out.scales[3 * i + c], out.stored ? b.out[7 + c][j] * b.in[7 + c][j] : b.out[7 + c][j], write);
-    if (out.mean2d)
-      for (int c = 0; c < 2; ++c) put(out.mean2d[2 * (in.n * pass.camera + i) + c], b.picture[c][j], write);
+    const int64_t row = 2 * (in.n * pass.camera + i);
+    for (int c = 0; c < 2; ++c) {
+      if (out.mean2d) put(out.mean2d[row + c], b.picture[c][j], write);
+      if (out.absgrad) put(out.absgrad[row + c], b.absolute[c][j], write);
+    }
     if (!out.viewmats) continue;
     for (int c = 0; c < 9; ++c) camera_sum[c] += g_R[c];
     for (int c = 0; c < 3; ++c) camera_sum[9 + c] += g_t[c];
@@ -181,7 +194,8 @@ void reduce(const Pass<T> &pass, Slice slice, Scratch<T> &scratch, const Gradien
       const ProjectedGrad<T> g = picture_gradient(s, sum);
       const T picture[6] = {g.x, g.y, g.z, g.cov_xx, g.cov_xy, g.cov_yy};
       for (int c = 0; c < 6; ++c) b.picture[c][b.n] = picture[c];
-      for (int c = 0; c < 3; ++c) colors[b.n][c] = sum[6 + c];
+      absolute_gradient(s, sum, b.absolute[0][b.n], b.absolute[1][b.n]);
+      for (int c = 0; c < 3; ++c) colors[b.n][c] = sum[8 + c];
       load_gaussian(in, s.id, b.n, b);
       if (out.opacities)  // sum[0] = o dL/do, and d o / d logit = o (1 - o)
         put(out.opacities[s.id], out.stored ? sum[0] * (1 - in.opacities[s.id]) : sum[0] / in.opacities[s.id], write);

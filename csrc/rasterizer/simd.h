@@ -68,6 +68,7 @@ struct Vec {
 //   fma(a, b, c) = a b + c, fnma(a, b, c) = c - a b, min, max, comparisons >= and <
 //   fraction(a, whole): a - floor(a), and the rest in the form that scale_by_power_of_two(p, whole) = p 2^whole wants
 //   reciprocal(a): relative error below 2e-7 in float
+//   magnitude(a) = |a|
 //   &, |, and_not(a, b) = a and not b, bits(m): lane j as bit j, any(m)
 //   keep(m, a) = m ? a : 0, select(m, a, b) = m ? a : b
 //   sum(a) over the lanes; transpose_sum(v): lane j is the sum over the lanes of v[j]
@@ -149,12 +150,17 @@ struct Pair {
   friend PairMask<T> operator<(Pair x, Pair y) { return {x.a < y.a, x.b < y.b}; }
   // Both registers into one sum.
   friend V add(Pair x, V sum) { return sum + x.a + x.b; }
+  friend V add_size(Pair x, V sum) { return sum + magnitude(x.a) + magnitude(x.b); }
   friend V add_product(Pair x, Pair y, V sum) { return fma(x.b, y.b, fma(x.a, y.a, sum)); }
 };
 
 template <class T>
 inline Vec<T> add(Vec<T> x, Vec<T> sum) {
   return sum + x;
+}
+template <class T>
+inline Vec<T> add_size(Vec<T> x, Vec<T> sum) {
+  return sum + magnitude(x);
 }
 template <class T>
 inline Vec<T> add_product(Vec<T> x, Vec<T> y, Vec<T> sum) {

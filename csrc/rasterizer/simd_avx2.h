@@ -9,6 +9,7 @@ inline VF fma(VF a, VF b, VF c) { return _mm256_fmadd_ps(a.v, b.v, c.v); }
 inline VF fnma(VF a, VF b, VF c) { return _mm256_fnmadd_ps(a.v, b.v, c.v); }
 inline VF min(VF a, VF b) { return _mm256_min_ps(a.v, b.v); }
 inline VF max(VF a, VF b) { return _mm256_max_ps(a.v, b.v); }
+inline VF magnitude(VF a) { return _mm256_andnot_ps(_mm256_set1_ps(-0.f), a.v); }
 inline VF fraction(VF a, VF &whole) { return whole = _mm256_floor_ps(a.v), a - whole; }
 inline VF scale_by_power_of_two(VF p, VF whole) {
   __m256i e = _mm256_slli_epi32(_mm256_cvtps_epi32(whole.v), 23);

@@ -9,6 +9,7 @@ inline VF fma(VF a, VF b, VF c) { return _mm512_fmadd_ps(a.v, b.v, c.v); }
 inline VF fnma(VF a, VF b, VF c) { return _mm512_fnmadd_ps(a.v, b.v, c.v); }
 inline VF min(VF a, VF b) { return _mm512_min_ps(a.v, b.v); }
 inline VF max(VF a, VF b) { return _mm512_max_ps(a.v, b.v); }
+inline VF magnitude(VF a) { return _mm512_abs_ps(a.v); }
 inline VF fraction(VF a, VF &whole) {
   return whole = a, _mm512_reduce_ps(a.v, _MM_FROUND_TO_NEG_INF);
 }  // scalef floors

@@ -24,6 +24,10 @@ inline Vec<T> max(Vec<T> a, Vec<T> b) {
   return a.v > b.v ? a.v : b.v;
 }
 template <class T>
+inline Vec<T> magnitude(Vec<T> a) {
+  return max(a, Vec<T>(T(0)) - a);
+}
+template <class T>
 inline Vec<T> reciprocal(Vec<T> a) {
   return (typename Vec<T>::Real{} + 1) / a.v;
 }

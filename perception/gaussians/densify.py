@@ -1,8 +1,9 @@
 """Adaptive density control: adds Gaussians by screen-space gradient up to a fixed budget, and prunes Gaussians.
 
-Densification: small Gaussians are cloned and large ones split (Kerbl et al. 2023, §5.2), with three changes. Candidates
-are ranked by gradient, and only as many as the budget allows are used. The opacities of a clone and its original are
-corrected to preserve the rendered image (Rota Bulò et al. 2024, eq. 11). Opacities decay instead of being reset.
+Densification: small Gaussians are cloned and large ones split (Kerbl et al. 2023, §5.2), with four changes. Gradients
+are absolute (Ye et al. 2024). Candidates are ranked by them, and only as many as the budget allows are used. The
+opacities of a clone and its original are corrected to preserve the rendered image (Rota Bulò et al. 2024, eq. 11).
+Opacities decay instead of being reset.
 
 Holes: densification only copies existing Gaussians, so regions that the map leaves empty are filled. Each view is
 divided into blocks of BLOCK × BLOCK pixels. An empty block gets one Gaussian of the block's size and the photo's mean
@@ -53,8 +54,8 @@ HOLE_OPACITY = 0.5
 
 @dataclass
 class Statistics:
-    """Sums since the last densification, all [N]: gradient norms of the 2D mean (in units of half the image's long
-    side), and how often a Gaussian was seen."""
+    """Sums since the last densification, all [N]: norms of the 2D mean's gradients, absolute or plain (in units of half
+    the image's long side), and how often a Gaussian was seen."""
 
     gradient: torch.Tensor
     seen: torch.Tensor

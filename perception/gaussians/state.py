@@ -117,6 +117,11 @@ class TrainingState:
     # ---------------------------------------------------------------- progress
 
     @property
+    def growing_by(self) -> str:
+        """The gradient by which Gaussians are chosen for growth."""
+        return "absgrad" if self.config.densify.absgrad else "mean2d"
+
+    @property
     def elapsed(self) -> float:
         """Seconds of training, including those before a resume, without the time between two calls of `run`."""
         return self.record.seconds + (0.0 if self._since is None else time.monotonic() - self._since)
@@ -198,7 +203,8 @@ class TrainingState:
         """
         self.gaussians = Gaussians(**self.optimiser.params)
         zeros = {name: torch.zeros_like(self.optimiser.params[stored]) for name, stored in STORED.items()}
-        self.gradients = Gradients(**zeros, mean2d=self.gaussians.means.new_zeros(1, len(self.gaussians), 2))
+        zeros[self.growing_by] = self.gaussians.means.new_zeros(1, len(self.gaussians), 2)
+        self.gradients = Gradients(**zeros)
 
     # -------------------------------------------------------------- checkpoint
 

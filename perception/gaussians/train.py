@@ -127,8 +127,7 @@ class Trainer(TrainingState):
             self._update(progress, gradients, out.visible[0])
         if schedule.grows_at(self, progress):
             with self.record.timed("densification"):
-                assert gradients.mean2d is not None  # for the type checker
-                self.statistics.add(gradients.mean2d[0], out.visible[0], max(height, width))
+                self.statistics.add(getattr(gradients, self.growing_by)[0], out.visible[0], max(height, width))
         self.record.pairs += out.frames.contributing
         self.iteration += 1
         return float(loss)

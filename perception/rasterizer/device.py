@@ -19,7 +19,7 @@ from perception.rasterizer.cuda.kernels import MAX_FEATURES, THREADS, KernelOpti
 from perception.rasterizer.types import Cotangents, Forward, Gradients, Inputs, Settings
 
 _POINTER = ctypes.c_void_p
-TILE, _SPLAT, _MOMENTS = 16, 12, 10  # as in device.h: pixels, numbers of a splat, of a record before its features
+TILE, _SPLAT, _MOMENTS = 16, 12, 12  # as in device.h: pixels, numbers of a splat, of a record before its features
 _GAUSSIANS = ("means", "quats", "scales", "opacities", "colors", "features")
 _CAMERAS = ("viewmats", "Ks", "background")
 _MAX_RECORDS = 1 << 24  # with eight feature channels 1.2 GB of records, and 0.4 GB of lists
@@ -50,7 +50,7 @@ STRIP = structure("Strip", "splats boxes front_to_back ends", "n first_row end_r
 LISTS = structure("Lists", "ids slots starts")
 IMAGES = structure("Images", "colors alphas depths features variance visible")
 COTANGENTS = structure("Cotangents", "colors alphas depths features variance")
-GRADIENTS = structure("Gradients", "means quats scales opacities colors features camera mean2d")
+GRADIENTS = structure("Gradients", "means quats scales opacities colors features camera mean2d absgrad")
 
 
 def filled(structure: Any, **values: Tensor | int | float | None) -> Any:
@@ -211,7 +211,8 @@ def rasterize_backward(
         for gradient in outputs.values():
             if gradient is not None:
                 gradient.zero_()
-    features, viewmats, mean2d = (outputs.pop(name) for name in ("features", "viewmats", "mean2d"))
+    features, viewmats = outputs.pop("features"), outputs.pop("viewmats")
+    by_camera = {name: outputs.pop(name) for name in ("mean2d", "absgrad")}
     cameras = None if viewmats is None else call.means.new_zeros((count, call.n, 12))
     if forward.features is None and call.dims:  # rendered without features, which are zeros, wanted for their gradient
         forward = replace(forward, features=call.means.new_zeros((*forward.alphas.shape, call.dims)))
@@ -226,7 +227,7 @@ def rasterize_backward(
                 **outputs,
                 features=None if features is None else features[:, begin:],
                 camera=None if cameras is None else cameras[camera],
-                mean2d=None if mean2d is None else mean2d[camera],
+                **{name: None if of is None else of[camera] for name, of in by_camera.items()},
             )
             width = _MOMENTS + min(call.dims - begin, MAX_FEATURES)
             for strip in strips:

@@ -94,9 +94,12 @@ class Cotangents:
 
 @dataclass
 class Gradients:
-    """dL/d(input) for each tensor of `Inputs` that has one, and for the 2D means in pixels; None: not wanted."""
+    """dL/d(input) for each tensor of `Inputs` that has one, and for the 2D means in pixels; None: not wanted.
 
-    NAMES: ClassVar = ("means", "quats", "scales", "opacities", "colors", "viewmats", "features", "mean2d")
+    absgrad: Σ over the pixels of the size of what each adds to mean2d (AbsGS, Ye et al. 2024). Slices of the feature
+    channels, 16 at once on a CPU and 8 on a GPU, are taken by their sizes too."""
+
+    NAMES: ClassVar = ("means", "quats", "scales", "opacities", "colors", "viewmats", "features", "mean2d", "absgrad")
 
     means: Tensor | None = None
     quats: Tensor | None = None
@@ -106,13 +109,14 @@ class Gradients:
     viewmats: Tensor | None = None
     features: Tensor | None = None
     mean2d: Tensor | None = None  # [C, N, 2]
+    absgrad: Tensor | None = None  # [C, N, 2]
 
     @classmethod
     def zeros(cls, inputs: Inputs, wanted: Collection[str]) -> Gradients:
         """Zeros for the tensors named in `wanted`."""
 
         def zero(name: str) -> Tensor:
-            if name == "mean2d":
+            if name in ("mean2d", "absgrad"):
                 return inputs.means.new_zeros((len(inputs.viewmats), len(inputs.means), 2))
             return torch.zeros_like(getattr(inputs, name), memory_format=torch.contiguous_format)
 

@@ -40,6 +40,23 @@ def test_random_scenes(dims, sh_degree, options):
     assert worst(emulate(inputs, **options), grads_and_images(inputs, **options)) <= BOUND
 
 
+def test_absolute_gradients():
+    inputs = passed(scene(n=200, dims=5))
+    settings, pull = Settings(37, 29), torch.Generator().manual_seed(1)
+
+    def found() -> torch.Tensor:
+        out = cpu.rasterize_forward(inputs, settings)
+        cotangents = Cotangents(torch.randn(out.colors.shape, generator=pull.manual_seed(1)).to(out.colors))
+        gradients = Gradients.zeros(inputs, ("absgrad",))
+        cpu.rasterize_backward(inputs, settings, out, cotangents, gradients)
+        assert gradients.absgrad is not None
+        return gradients.absgrad
+
+    here = found()
+    with on_emulator(emulated()):
+        assert worst([found()], [here]) <= BOUND
+
+
 def test_gaussians_over_the_whole_image():
     inputs = wide_scene()
     assert worst(emulate(inputs), grads_and_images(inputs)) <= BOUND

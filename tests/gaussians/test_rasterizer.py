@@ -215,6 +215,27 @@ def test_backward_may_run_twice_and_adds_up():
     assert torch.equal(inputs["means"].grad, 2 * once)
 
 
+def test_absolute_gradients_are_the_sizes_of_what_each_pixel_adds_to_that_of_the_2d_mean():
+    inputs, taps = scene(n=80, width=70, height=45, cameras=1), []
+    theirs = reference.rasterize(**leaves(inputs), taps=taps)
+    images = [theirs[name] for name in IMAGES]
+    pulls = torch.autograd.grad(loss_of(images), images, retain_graph=True)
+    torch.autograd.backward(images, pulls)
+    index, vectors, conics = taps[0]
+    x, y = vectors.grad.unbind(-1)  # [n, P]
+    along = (conics[:, 0, 1] / conics[:, 0, 0])[:, None] * x  # the part of y that comes with x
+    plain, absolute = torch.zeros(2, 80, 2, dtype=torch.float64)
+    plain[index] = torch.stack([x.sum(1), y.sum(1)], 1)
+    absolute[index] = torch.stack([x.abs().sum(1), (along.abs() + (y - along).abs()).sum(1)], 1)
+
+    given, settings = passed(inputs), Settings(70, 45)
+    found = Gradients.zeros(given, ("mean2d", "absgrad"))
+    cotangents = Cotangents(**dict(zip(IMAGES, pulls, strict=True)))
+    cpu.rasterize_backward(given, settings, cpu.rasterize_forward(given, settings), cotangents, found)
+    for ours, expected in ((found.mean2d, plain), (found.absgrad, absolute)):
+        torch.testing.assert_close(ours[0], expected, rtol=1e-8, atol=1e-9 * float(expected.abs().max()))
+
+
 def test_statistics_are_the_2d_mean_gradient_in_pixels():
     # One tiny Gaussian: moving it by δ px in x is moving its mean by δ z / fx.
     inputs = leaves(scene(n=1, dims=0, cameras=1))

@@ -49,7 +49,7 @@ def sh_colors(degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
     return (torch.einsum("nk,nkc->nc", b, coefficients[:, : b.shape[1]]) + 0.5).clamp(min=0)
 
 
-def _camera(means, quats, scales, opacities, colors, viewmat, k, width, height, features, near_plane, eps2d):  # type: ignore[no-untyped-def]
+def _camera(means, quats, scales, opacities, colors, viewmat, k, width, height, features, near_plane, eps2d, taps=None):  # type: ignore[no-untyped-def]
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     p = means @ rotation.T + translation
     fx, fy, cx, cy = k[0, 0], k[1, 1], k[0, 2], k[1, 2]
@@ -79,6 +79,9 @@ def _camera(means, quats, scales, opacities, colors, viewmat, k, width, height, 
     )
     pixels = torch.stack([xs, ys], -1).reshape(-1, 2)
     d = torch.stack([fx * u + cx, fy * v + cy], -1)[:, None] - pixels[None]
+    if taps is not None:
+        d.retain_grad()
+        taps.append((index, d, conic.detach()))
     q = torch.einsum("npi,nij,npj->np", d, conic, d)
     raw = opacities[index][:, None] * torch.exp(-0.5 * q)
     alpha = torch.where(raw >= 1 / 255, raw.clamp(max=0.999), torch.zeros_like(raw))
@@ -107,9 +110,13 @@ def _camera(means, quats, scales, opacities, colors, viewmat, k, width, height, 
 
 def rasterize(
     means, quats, scales, opacities, colors, viewmats, Ks, width, height,
-    sh_degree=None, features=None, background=None, near_plane=0.01, eps2d=0.3,
+    sh_degree=None, features=None, background=None, near_plane=0.01, eps2d=0.3, taps=None,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
-    """The same arguments as perception.rasterize; a dict of tensors with the same names."""
+    """The same arguments as perception.rasterize; a dict of tensors with the same names.
+
+    taps: a list to which each camera adds the indices [n] of its Gaussians, the vectors [n, P, 2] from the pixels to
+    the 2D means, of which autograd then keeps the gradient, and the inverse covariances [n, 2, 2].
+    """
     results = []
     for c in range(viewmats.shape[0]):
         rgb = colors
@@ -117,7 +124,7 @@ def rasterize(
             centre = -viewmats[c, :3, :3].T @ viewmats[c, :3, 3]
             rgb = sh_colors(sh_degree, means - centre, colors)
         out, visible = _camera(
-            means, quats, scales, opacities, rgb, viewmats[c], Ks[c], width, height, features, near_plane, eps2d
+            means, quats, scales, opacities, rgb, viewmats[c], Ks[c], width, height, features, near_plane, eps2d, taps
         )
         t = out.pop("transmittance")
         if background is not None:
