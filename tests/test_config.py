@@ -38,7 +38,7 @@ def test_the_papers_preset_is_the_published_method() -> None:
             "effort": 1, "iterations": 30_000, "time_limit": None, "exchange_db": 0, "budget": 2_000_000,
             "block_photos": 0, "sh_degree": 3,
         },
-        "densify": {"every": 100, "grad_threshold": 3.5e-4},
+        "densify": {"every": 100, "grad_threshold": 3.5e-4, "absgrad": False},
         "losses": {
             "feature_dim": 8, "variance_weight": 0.5, "margin": 1,
             "depth_weight": 0, "start": 0, "every": 1, "half_resolution": False,

@@ -7,10 +7,11 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from perception.config import DensifyConfig
+from perception.config import DensifyConfig, load_config
 from perception.gaussians.densify import START, STOP, Statistics, densify, rotation_matrices, target_count
 from perception.gaussians.model import Gaussians, from_points
-from perception.gaussians.views import depth_image
+from perception.gaussians.train import Trainer
+from perception.gaussians.views import TrainingView, depth_image
 
 THRESHOLD = DensifyConfig().grad_threshold
 
@@ -35,6 +36,22 @@ def test_the_budget_holds(allowed: int, extent: float) -> None:
 def test_nothing_grows_below_the_threshold() -> None:
     keep, born = densify(cloud(), statistics(50, THRESHOLD / 2), 1000, 1.0, THRESHOLD, seed=1)
     assert keep.tolist() == list(range(50)) and len(born) == 0
+
+
+@pytest.mark.parametrize("absolute", [True, False])
+def test_a_gaussian_over_stripes_grows_only_by_absolute_gradients(absolute: bool) -> None:
+    """A picture of mirror symmetry pulls the Gaussian in its middle to both sides alike."""
+    stripes = np.broadcast_to(255 * (np.abs(np.arange(32) - 15.5).astype(int) // 4 % 2)[None, :, None], (32, 32, 3))
+    K = torch.tensor([[32.0, 0, 16], [0, 32, 16], [0, 0, 1]])
+    view = TrainingView("0", torch.from_numpy(stripes.astype(np.uint8)), None, K, torch.eye(4))
+    one = from_points(np.array([[0.0, 0, 2]]), np.full((1, 3), 128, np.uint8), feature_dim=3, seed=0, opacity=0.5)
+    one.log_scales[:] = np.log(0.2)
+    pairs = [f"densify.absgrad={absolute}", "train.iterations=1000", "losses.half_resolution=false"]
+    trainer = Trainer(one, [view], load_config(None, pairs), [])
+    trainer._background = lambda: torch.full((1, 3), 0.5)  # type: ignore[method-assign]
+    trainer.step(0.2)
+    found = float(trainer.statistics.gradient / trainer.statistics.seen)
+    assert found > THRESHOLD if absolute else found < THRESHOLD / 1000
 
 
 def test_a_clone_and_its_original_hide_as_much_as_before() -> None:
