@@ -6,7 +6,9 @@ Heinly et al., "Correcting for duplicate scene structure in sparse 3D reconstruc
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import permutations, product
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 from PIL import Image
+from scipy.spatial import cKDTree
 
 SIDE, RADIUS, SHIFTS = 800, 6, (-2.0, 0.0, 2.0)
 """Pixels: long side at which photos are compared, half a patch, displacements in x and y for errors of the poses."""
@@ -21,16 +24,25 @@ TEXTURE, CORRELATION = 6.0, 0.6
 """Least standard deviation of a patch in grey values; least normalised cross-correlation of patches that look alike."""
 DEGREES, BINS = 45.0, 9
 """Largest angle between the two rays to a point; bins of equal width up to it."""
-MOST, PAIRS, LEAST, CLEARLY = 100, 500, 100, 1.4
-"""Points compared of two photos; pairs of photos that tell how many are usually alike; points in all that tell
-something; ratio that decides. Four photos of right models read 0.8 to 1.3, on the wrong side of a room 0.5."""
+APART = 1 / 16
+"""Points so near to one that both photos match tell nothing: what repeats is matched. Share of the photo's width."""
+MOST, PAIRS = 100, 500
+"""Points compared of two photos; pairs of photos that tell how many are usually alike."""
+CLEARLY, SURE = 1.4, 3
+"""Ratio of two likenesses that decides; points that look alike and more or fewer of which decide nothing."""
+Likeness = tuple[float, float]
+"""How many of the compared points look alike, and how many usually do at the same angles between the rays."""
 
 
 @dataclass(frozen=True)
-class _Photo:
+class Photo:
+    """gray: at a reduced size. camera: of pycolmap. pose: camera_from_world [3, 4]. points: pixels in full resolution,
+    by the id of the point that is matched there."""
+
     gray: np.ndarray
     camera: Any
     pose: np.ndarray
+    points: dict[int, np.ndarray]
 
     @property
     def center(self) -> np.ndarray:
@@ -48,47 +60,79 @@ class _Photo:
         return found.astype(np.float64)
 
 
-def looks_better(now: Any, before: Any, photos: Path, moved: set[int]) -> bool:
-    """Whether photos `moved` of a pycolmap model look clearly more like the others than in the model before."""
-    others = set(now.reg_image_ids()) & set(before.reg_image_ids()) - moved
-    return likeness(now, photos, moved, others) > CLEARLY * likeness(before, photos, moved, others) > 0
+@dataclass(frozen=True)
+class Looks:
+    """xyz: points of a model by id. photos: by image id."""
 
+    xyz: dict[int, np.ndarray]
+    photos: dict[int, Photo]
 
-def likeness(model: Any, photos: Path, some: set[int], others: set[int]) -> float:
-    """How many points look alike in one of `some` and one of `others`, relative to as many of pairs among `others` with
-    the same angles between the rays; 0 if too few are compared. Points that one of two photos shows are compared where
-    the other should see them and is not matched with them."""
-    seen: dict[int, set[int]] = {image: set() for image in sorted(some | others)}
-    for number, point in model.points3D.items():
-        for element in point.track.elements:
-            seen.get(element.image_id, set()).add(number)
-    views = {image: _photo(model.images[image], photos) for image in seen}
+    @classmethod
+    def of(cls, model: Any, root: Path, images: Iterable[int]) -> Looks:
+        """Of some photos of a pycolmap model."""
+        seen: dict[int, dict[int, np.ndarray]] = {image: {} for image in sorted(images)}
+        for number, point in model.points3D.items():
+            for element in point.track.elements:
+                if element.image_id in seen:
+                    seen[element.image_id][number] = model.images[element.image_id].points2D[element.point2D_idx].xy
+        photos = {image: (model.images[image], points) for image, points in seen.items()}
+        xyz = {number: point.xyz for number, point in model.points3D.items()}
+        made = {
+            i: (loaded(root / of.name), of.camera, of.cam_from_world().matrix(), at) for i, (of, at) in photos.items()
+        }
+        return cls(xyz, {image: Photo(*each) for image, each in made.items()})
 
-    def counted(pairs: list[tuple[int, int]]) -> np.ndarray:
-        """[2, BINS]: points by angle, and those of them that look alike."""
+    @cached_property
+    def usual(self) -> np.ndarray:
+        """`counted` of pairs of all photos, at most PAIRS."""
+        pairs = list(permutations(self.photos.values(), 2))
+        return self.counted(pairs[:: max(1, -(-len(pairs) // PAIRS))])
+
+    def counted(self, pairs: Iterable[tuple[Photo, Photo]]) -> np.ndarray:
+        """[2, BINS]: points compared by the angle between the rays, and those of them that look alike."""
         found = np.zeros((2, BINS))
         for a, b in pairs:
-            xyz = np.array([model.points3D[number].xyz for number in sorted(seen[a] - seen[b])]).reshape(-1, 3)
-            degrees, alike = _compared(views[a], views[b], xyz)
+            degrees, alike = _compared(a, b, self._telling(a, b))
             each = np.minimum(degrees * BINS / DEGREES, BINS - 1).astype(int)
             found += [np.bincount(each, minlength=BINS), np.bincount(each, alike, minlength=BINS)]
         return found
 
-    pairs = list(permutations(seen, 2))
-    across, within = ([pair for pair in pairs if len(some & set(pair)) == count] for count in (1, 0))
-    compared, alike = counted(across)
-    usual, usually = counted(within[:: max(1, -(-len(within) // PAIRS))])
-    expected = (compared * usually / np.maximum(usual, 1)).sum()
-    return float(alike[usual > 0].sum() / expected) if expected and compared.sum() >= LEAST else 0.0
+    def likeness(self, some: Iterable[Photo], others: Iterable[int]) -> Likeness:
+        """Of the photos `some` beside `others`."""
+        beside = [(a, self.photos[b]) for a, b in product(some, others)]
+        found = self.counted([*beside, *((b, a) for a, b in beside)])
+        expected = found[0] * self.usual[1] / np.maximum(self.usual[0], 1)
+        return float(found[1, self.usual[0] > 0].sum()), float(expected.sum())
+
+    def _telling(self, a: Photo, b: Photo) -> np.ndarray:
+        """The points [N, 3] of a that are not matched in b, nor near those that are."""
+        both, only = ([at for at in a.points if (at in b.points) == matched] for matched in (True, False))
+        if both and only:
+            matched, pixels = (np.array([a.points[at] for at in each]) for each in (both, only))
+            far = cKDTree(matched).query(pixels)[0] > APART * a.camera.width
+            only = [at for at, apart in zip(only, far, strict=True) if apart]
+        return np.array([self.xyz[at] for at in sorted(only)]).reshape(-1, 3)
 
 
-def _photo(image: Any, photos: Path) -> _Photo:
-    with Image.open(photos / image.name) as file:
+def looks_better(now: Likeness, before: Likeness) -> bool:
+    """Whether the first is clearly better, whatever SURE points look like."""
+    return now[0] / (now[1] + SURE) > CLEARLY * (before[0] + SURE) / (before[1] + SURE)
+
+
+def likeness(model: Any, root: Path, some: set[int], others: set[int]) -> Likeness:
+    """Of the photos `some` of a pycolmap model beside `others`: points that one of two photos shows are compared where
+    the other should see them, and neither matches them or what is near."""
+    return Looks.of(model, root, others).likeness(Looks.of(model, root, some).photos.values(), others)
+
+
+def loaded(path: Path) -> np.ndarray:
+    """Grey values [h, w] of a photo at a reduced size."""
+    with Image.open(path) as file:
         file.thumbnail((SIDE, SIDE))
-        return _Photo(np.asarray(file.convert("L")), image.camera, image.cam_from_world().matrix())
+        return np.asarray(file.convert("L"))
 
 
-def _compared(a: _Photo, b: _Photo, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _compared(a: Photo, b: Photo, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of the points [N, 3] of a, those that b should see: degrees between the rays, whether they look alike."""
     xyz = xyz[(xyz @ b.pose[:, :3].T + b.pose[:, 3])[:, 2] > 0]
     toward = np.stack([xyz - a.center, xyz - b.center])

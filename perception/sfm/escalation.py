@@ -20,7 +20,8 @@ from perception.geometry import align_similarity
 from perception.io.atomic import atomic_directory, recover
 from perception.photos.lens import load_pycolmap
 from perception.sfm import merge
-from perception.sfm.appearance import looks_better
+from perception.sfm.alternatives import settled
+from perception.sfm.appearance import likeness, looks_better
 from perception.sfm.consistency import consistent_photos, fold_warnings, stronger_contradictions, verified_pairs
 from perception.sfm.database import FeatureStore, delete_pairs, verified_matches
 from perception.sfm.feature_tasks import write_part
@@ -100,7 +101,7 @@ class Escalation:
         names, few = self.best.store.names, len(self.best.store.names) <= REPEATABLE_PHOTOS
         steps: list[dict[str, Any]] = [{"step": "at once", "registered": len(self.best.registered)}]
         tries = {"more features": self._grow, **({"mapping anew": self._anew} if few else {})}
-        tries |= {"joining models": self._join, "guided matching": self._guide}
+        tries |= {"comparing photos": self._compare, "joining models": self._join, "guided matching": self._guide}
         tries |= {"global mapping": self._global} if few else {}
         for name, attempt in tries.items():
             registered, started = len(self.best.registered), time.perf_counter()
@@ -110,7 +111,7 @@ class Escalation:
             self.more = self.more or self._more_features()
             found = attempt(self.more)
             if found is not None and self._is_better(found):
-                self.best = self.rival = found
+                self.best, self.rival, self.more = found, found, found.store
             spent = time.perf_counter() - started
             steps.append({"step": name, "registered": len(self.best.registered), "seconds": spent})
         return self.best, steps
@@ -198,7 +199,8 @@ class Escalation:
                 start = self._adjusted([merge.part_of(whole, set(kept))], less)
                 model = self._adjusted(self._mapped(start, less)[0][:1], less)
             moved = set(taken & set(model.reg_image_ids()))
-            if moved and looks_better(model, whole, store.image_root, moved):
+            others = set(model.reg_image_ids()) & found.registered - moved
+            if moved and looks_better(*(likeness(each, store.image_root, moved, others) for each in (model, whole))):
                 right = {(pair.i, pair.j) for pair in verified_pairs(model, store.database) if pair.agrees}
                 delete_pairs(store.database, {pair for pair in held - right if moved & set(pair)})
                 return self._checked([model], found.contradicted, store)
@@ -218,6 +220,23 @@ class Escalation:
             return []
         return [self._grown(self._adjusted([main, other], store), store, joined=True)]
 
+    def _compare(self, store: FeatureStore) -> Candidate | None:
+        """The best model, with photos added where they look right, and without the pairs that put one elsewhere."""
+        if self.best.folded or not self.best.models:
+            return None
+        less, wrong, known = self._copied(store, "compared"), set[tuple[int, int]](), -1
+        model = self._adjusted(self.best.models[:1], less)
+        while len(wrong) > known:
+            known = len(wrong)
+            while (found := settled(model, store, wrong, self.options.seed))[1] - wrong:
+                wrong |= found[1]
+                delete_pairs(less.database, found[1])
+                kept = merge.part_of(model, set(model.reg_image_ids()) - set(found[0].reg_image_ids()))
+                model = self._adjusted([kept, found[0]], less)
+            if wrong:
+                model = self._mapped(model, less)[0][0]
+        return self._grown(model, less) if wrong else None
+
     def _join(self, store: FeatureStore) -> Candidate | None:
         """One model of those that share photos."""
         groups = merge.align(merge.without_repeats(self.known), self.options.seed)
@@ -227,11 +246,7 @@ class Escalation:
         """The best model, with more matches of the photos that are left out and their best partners."""
         if not self.best.models:
             return None
-        folder, linked = store.folder / "guided", self._linked(store)
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir()
-        guided = FeatureStore(folder, store.image_root, store.names, store.facts, THOROUGH)
-        shutil.copyfile(store.database, guided.database)
+        guided, linked = self._copied(store, "guided"), self._linked(store)
         pairs = set[tuple[int, int]]()
         for image in {image for pair in linked for image in pair} - self.best.registered:
             mine = [pair for pair in linked if image in pair]
@@ -321,11 +336,15 @@ class Escalation:
                 extract(database, store.image_root, [each for each in groups if each[0]], progress, THOROUGH)
                 match(database, [(names[i], names[j]) for i, j in chosen], self.options.seed, progress, THOROUGH)
         facts = {**store.facts, "pairs_matched": len(verified_matches(folder / store.database.name))}
-        work = folder / "work"  # pairs are deleted from a copy: an interrupted call begins with all
-        shutil.rmtree(work, ignore_errors=True)
-        work.mkdir()
-        shutil.copyfile(folder / store.database.name, work / store.database.name)
-        return FeatureStore(work, store.image_root, names, facts, THOROUGH)
+        made = FeatureStore(folder, store.image_root, names, facts, THOROUGH)
+        return self._copied(made, "work")  # pairs are deleted from a copy: an interrupted call begins with all
+
+    def _copied(self, store: FeatureStore, name: str) -> FeatureStore:
+        folder = store.folder / name
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        shutil.copyfile(store.database, folder / store.database.name)
+        return replace(store, folder=folder)
 
 
 def _best(found: list[Candidate]) -> Candidate:
