@@ -50,8 +50,6 @@ SHARED = 20
 """Least number of points that a photo shares with two others: points of two photos alone leave a chain's scale open."""
 CANDIDATES = 4
 """Models mapped anew of which the best is used; two from all pairs, two from the stronger ones."""
-GUIDED = 8
-"""Each photo left out is matched by guidance with so many photos, those with which it has most verified matches."""
 HELD = 0.5, 0.2
 """Shares of the matches of a pair, tried in turn, from which on it holds a photo where it is; by chance 0.13 agree."""
 
@@ -101,7 +99,7 @@ class Escalation:
         names, few = self.best.store.names, len(self.best.store.names) <= REPEATABLE_PHOTOS
         steps: list[dict[str, Any]] = [{"step": "at once", "registered": len(self.best.registered)}]
         tries = {"more features": self._grow, **({"mapping anew": self._anew} if few else {})}
-        tries |= {"comparing photos": self._compare, "joining models": self._join, "guided matching": self._guide}
+        tries |= {"comparing photos": self._compare, "joining models": self._join}
         tries |= {"global mapping": self._global} if few else {}
         for name, attempt in tries.items():
             registered, started = len(self.best.registered), time.perf_counter()
@@ -145,13 +143,10 @@ class Escalation:
             enough = [db.num_keypoints_for_image(image) >= FEW_FEATURES for image in ids]
         return [row for row, image in enumerate(ids) if enough[row] and image not in done]
 
-    def _linked(self, store: FeatureStore) -> dict[tuple[int, int], int]:
-        """Verified matches of the pairs of photos, by image ids, that are not in one model."""
-        done = [set(model.reg_image_ids()) for model in self.best.models]
-        verified = verified_matches(store.database).items()
-        return {
-            pair: len(found) for pair, found in verified if len(found) and not any(each >= set(pair) for each in done)
-        }
+    def _linked(self, store: FeatureStore) -> bool:
+        """Whether photos that are not in one model have verified matches."""
+        done, verified = [set(model.reg_image_ids()) for model in self.best.models], verified_matches(store.database)
+        return any(len(found) and not any(each >= set(pair) for each in done) for pair, found in verified.items())
 
     # ------------------------------------------------------------------ steps
 
@@ -221,8 +216,9 @@ class Escalation:
         return [self._grown(self._adjusted([main, other], store), store, joined=True)]
 
     def _compare(self, store: FeatureStore) -> Candidate | None:
-        """The best model, with photos added where they look right, and without the pairs that put one elsewhere."""
-        if self.best.folded or not self.best.models:
+        """The best model, if it has half of the photos, with others added where they look right, and without the pairs
+        that put one elsewhere."""
+        if self.best.folded or 2 * len(self.best.registered) < len(store.names):
             return None
         less, wrong, known = self._copied(store, "compared"), set[tuple[int, int]](), -1
         model = self._adjusted(self.best.models[:1], less)
@@ -241,22 +237,6 @@ class Escalation:
         """One model of those that share photos."""
         groups = merge.align(merge.without_repeats(self.known), self.options.seed)
         return self._grown(self._adjusted(groups[0], store), store) if groups and len(groups[0]) > 1 else None
-
-    def _guide(self, store: FeatureStore) -> Candidate | None:
-        """The best model, with more matches of the photos that are left out and their best partners."""
-        if not self.best.models:
-            return None
-        guided, linked = self._copied(store, "guided"), self._linked(store)
-        pairs = set[tuple[int, int]]()
-        for image in {image for pair in linked for image in pair} - self.best.registered:
-            mine = [pair for pair in linked if image in pair]
-            pairs |= set(sorted(mine, key=lambda pair: (-linked[pair], pair))[:GUIDED])
-        delete_pairs(guided.database, pairs)
-        with load_pycolmap().Database.open(guided.database) as db:
-            names = {image.image_id: image.name for image in db.read_all_images()}
-        chosen = [(names[one], names[other]) for one, other in sorted(pairs)]
-        match(guided.database, chosen, self.options.seed, self.options.progress, THOROUGH, guided=True)
-        return self._grown(self._adjusted(self.best.models[:1], guided), guided)
 
     def _global(self, store: FeatureStore) -> Candidate | None:
         pycolmap = load_pycolmap()

@@ -113,15 +113,9 @@ def _camera_key(photo: Path) -> tuple[Any, ...]:
 
 
 def match(
-    database: Path,
-    chosen: Sequence[Sequence[str]],
-    seed: int,
-    progress: Progress,
-    effort: Effort = QUICK,
-    guided: bool = False,
+    database: Path, chosen: Sequence[Sequence[str]], seed: int, progress: Progress, effort: Effort = QUICK
 ) -> None:
-    """Matches and verifies the chosen pairs of photos, given by their names in the database.
-    guided: once more, along the epipolar lines of what is verified, where more features have only one candidate."""
+    """Matches and verifies the chosen pairs of photos, given by their names in the database."""
     pycolmap = load_pycolmap()
     progress.update("poses: matching", 0, len(chosen))
     matching = pycolmap.FeatureMatchingOptions()
@@ -129,8 +123,7 @@ def match(
     # The index of descriptors is trained with OpenBLAS, in pycolmap's wheel one without threads or locks. With several
     # threads it differed now and then, and with it the matches. The verification uses all threads.
     matching.num_threads = 1
-    matching.skip_geometric_verification = not guided
-    matching.guided_matching = guided
+    matching.skip_geometric_verification = True
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     verification.ransac.max_num_trials = effort.trials
@@ -141,6 +134,5 @@ def match(
         some = chosen[first : first + PAIRS_AT_ONCE]
         listed.match_list_path.write_text("".join(f"{one} {other}\n" for one, other in some))
         pycolmap.match_image_pairs(database, matching, listed, verification)
-        if not guided:
-            pycolmap.verify_matches(database, listed.match_list_path, verification)
+        pycolmap.verify_matches(database, listed.match_list_path, verification)
         progress.update("poses: matching", first + len(some), len(chosen))

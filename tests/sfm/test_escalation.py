@@ -98,7 +98,6 @@ def escalated(
     early = room.store(folder / "early", QUICK, lambda i, j: not {i, j} & LATE and j - i < 5)
     more = room.store(folder / "early" / MORE, THOROUGH, linked, alike)
     monkeypatch.setattr(Escalation, "_more_features", lambda self: more)
-    monkeypatch.setattr(Escalation, "_guide", lambda *_: None)  # there are no descriptors
     first = Candidate(*map_photos(early, False, 0, PHOTOS, told), early)
     best, steps = Escalation(first, [], False, ReadOptions(folder, progress=told)).run()
     return first, best, steps, told
