@@ -46,8 +46,9 @@ DOUBT = 4
 """Photos are not added if over 1/DOUBT of the matched pairs between them and the others contradict their poses."""
 MOVED = 0.05
 """Nor if this moves the photos registered before, in the median and relative to their mean distance from the centre."""
-SHARED = 20
-"""Least number of points that a photo shares with two others: points of two photos alone leave a chain's scale open."""
+SHARED = 30
+"""Least number of points that a photo shares with two others: points of two photos alone leave a chain's scale open.
+Right photos had 43 or more, a wrong one at the end of a chain 25."""
 CANDIDATES = 4
 """Models mapped anew of which the best is used; two from all pairs, two from the stronger ones."""
 HELD = 0.5, 0.2

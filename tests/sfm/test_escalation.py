@@ -16,7 +16,7 @@ from perception.geometry import align_similarity
 from perception.sfm import features
 from perception.sfm.consistency import Pair, consistent_photos, stronger_contradictions
 from perception.sfm.database import FeatureStore
-from perception.sfm.escalation import MORE, Candidate, Escalation
+from perception.sfm.escalation import MORE, Candidate, Escalation, _loose
 from perception.sfm.features import QUICK, THOROUGH, Effort
 from perception.sfm.incremental import map_photos
 from perception.sfm.options import ReadOptions
@@ -193,3 +193,13 @@ def test_the_larger_side_of_a_fold_is_kept() -> None:
     lost = [Pair(0, 10, 300, 1.0), Pair(1, 10, 30, 0.0), Pair(2, 10, 20, 0.0)]  # more photos contradict it
     assert consistent_photos([*one, *lost]) == set(range(6))
     assert consistent_photos([]) == set()
+
+
+@pytest.mark.parametrize(("points", "loose"), [(29, {1, 2, 3, 4}), (30, set())])
+def test_photos_are_loose_that_share_few_points_with_two_others(points: int, loose: set[int]) -> None:
+    """pycolmap itself places no photo by fewer than 30 points."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 4
+    options.num_points3D = points  # each seen by all four photos
+    model = pycolmap.synthesize_dataset(options)
+    assert _loose(model) == loose
