@@ -1,14 +1,15 @@
-"""Reader of `.spz` (Niantic's open format), versions 1 to 3. Version 4 packs by zstd, which Python lacks.
+"""Reader of `.spz` (Niantic's open format), versions 1 to 4.
 
-A gzip stream of a header and one attribute after the other. Axes are right, up, back, where those of a 3DGS PLY are
-right, down, front: y and z change sign, and with them the harmonics that are odd in one of them.
+A gzip stream of a header and one attribute after the other; in version 4 a plain header, a table of the sizes of the
+attributes' streams (compressed and not, 64 bits each), and those, by zstd. Axes are right, up, back, where those of a
+3DGS PLY are right, down, front: y and z change sign, and with them the harmonics that are odd in one of them.
 
     attribute   bytes a Gaussian   value
     positions   9 (6: version 1)   24-bit integers in steps of 2^−bits; float16 in version 1
     alphas      1                  opacity in steps of 1 / 255
     colours     3                  harmonics of degree 0, (byte / 255 − 1/2) / 0.15
     scales      3                  logarithm of σ, byte / 16 − 10
-    rotations   3 (4: version 3)   x y z of the quaternion, byte / 127.5 − 1; version 3: its smallest three
+    rotations   3 (4: from 3 on)   x y z of the quaternion, byte / 127.5 − 1; from version 3 on: its smallest three
     harmonics   3 K                (byte − 128) / 128, colour by colour of each of K coefficients
 """
 
@@ -21,13 +22,14 @@ from pathlib import Path
 
 import numpy as np
 
-from perception.errors import InputError
+from perception.errors import InputError, missing_extra
 
-MAGIC, VERSIONS = 0x5053474E, (1, 2, 3)
-HEADER = "<IIIBBBB"
+MAGIC, VERSIONS = 0x5053474E, (1, 2, 3, 4)
+HEADER, HEADER_4 = "<IIIBBBB", "<IIIBBBBI12x"
 COLOR_SCALE = 0.15
-FLIPS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
-"""Signs of the harmonics of degrees 1 to 3 when y and z change sign."""
+FLIPS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1, -1, 1, -1, 1, 1, -1, 1, -1, 1], np.float32)
+"""Signs of the harmonics of degrees 1 to 4 when y and z change sign."""
+_EXPECTED = "expected a .spz file of version 1 to 4"
 
 
 def read_spz(path: Path) -> dict[str, np.ndarray]:
@@ -35,24 +37,26 @@ def read_spz(path: Path) -> dict[str, np.ndarray]:
     a 3DGS PLY. InputError for another version, and for a file that is damaged or none."""
     try:
         data = path.read_bytes()
-        if data[:4] == struct.pack("<I", MAGIC):
-            raise InputError(_version(path, struct.unpack_from("<I", data, 4)[0]))
-        raw = gzip.decompress(data)
+        plain = data[:4] == struct.pack("<I", MAGIC)
+        raw = data if plain else gzip.decompress(data)
         magic, version, count, degree, bits, *_ = struct.unpack_from(HEADER, raw)
-    except (OSError, EOFError, zlib.error, struct.error) as error:
-        raise InputError(f"{path}: cannot be read ({error}); expected a .spz file of version 1 to 3") from error
-    if magic != MAGIC or degree > 3:
-        raise InputError(f"{path}: is no .spz file; expected a .spz file of version 1 to 3, harmonics up to degree 3")
-    if version not in VERSIONS:
-        raise InputError(_version(path, version))
-    coefficients, at = (degree + 1) ** 2 - 1, struct.calcsize(HEADER)
-    widths = (6 if version == 1 else 9, 1, 3, 3, 4 if version == 3 else 3, 3 * coefficients)
-    if len(raw) < at + count * sum(widths):
-        whole = (len(raw) - at) // sum(widths)
+        if magic != MAGIC or degree > 4:
+            raise InputError(f"{path}: is no .spz file; {_EXPECTED}, harmonics up to degree 4")
+        if version not in VERSIONS or plain != (version == 4):
+            raise InputError(f"{path}: is .spz of version {version}, versions 1 to 4 are read; save it as .ply")
+        coefficients = (degree + 1) ** 2 - 1
+        widths = (6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3, 3 * coefficients)
+        streams = _unpacked(raw, [count * width for width in widths]) if plain else raw[struct.calcsize(HEADER) :]
+    except InputError:
+        raise
+    except (OSError, EOFError, zlib.error, struct.error, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); {_EXPECTED}") from error
+    if len(streams) < count * sum(widths):
+        whole = len(streams) // sum(widths)
         raise InputError(f"{path}: is cut short: holds {whole} of the {count} Gaussians of its header; copy it anew")
-    parts = []
+    parts, at = [], 0
     for width in widths:
-        parts.append(np.frombuffer(raw, np.uint8, count * width, at).reshape(count, width))
+        parts.append(np.frombuffer(streams, np.uint8, count * width, at).reshape(count, width))
         at += count * width
     positions, alphas, colors, scales, turns, rest = parts
     opacity = np.clip(alphas[:, 0] / 255, 1e-6, 1 - 1e-6)
@@ -68,8 +72,25 @@ def read_spz(path: Path) -> dict[str, np.ndarray]:
     }
 
 
-def _version(path: Path, found: int) -> str:
-    return f"{path}: is .spz of version {found}, versions 1 to 3 are read; save it as .ply or as version 3"
+def _unpacked(data: bytes, sizes: list[int]) -> bytes:
+    """The attributes of a file of version 4, of such sizes in bytes, one after the other. ValueError where the file's
+    table has others, or a stream is damaged."""
+    try:
+        import zstandard
+    except ImportError as error:
+        raise missing_extra("zstandard", "spz") from error
+    *_, count, at = struct.unpack_from(HEADER_4, data)
+    table = np.frombuffer(data, "<u8", 2 * count, at).reshape(count, 2).tolist()
+    if [size for _, size in table] != [size for size in sizes if size]:
+        raise ValueError("attributes are not of the size that its header tells")
+    at, parts = at + 16 * count, []
+    for length, size in table:
+        try:
+            parts.append(zstandard.ZstdDecompressor().stream_reader(data[at : at + length]).read(size))
+        except zstandard.ZstdError as error:
+            raise ValueError(error) from error
+        at += length
+    return b"".join(parts)
 
 
 def _positions(stored: np.ndarray, version: int, bits: int) -> np.ndarray:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
 from plyfile import PlyData, PlyElement
 
 from perception.errors import InputError
@@ -112,6 +113,12 @@ def test_rows_that_are_no_numbers_are_kept_and_counted(tmp_path: Path) -> None:
     assert any("4 Gaussians that are not finite" in note for note in splat.notes)
 
 
+def turned(degree: int) -> np.ndarray:
+    """[K] signs of the harmonics of degrees 1 and more when y and z change sign: Y_lm has the parity of m + l in z, and
+    is odd in y where m is negative."""
+    return np.array([(-1) ** (m + n) * (-1 if m < 0 else 1) for n in range(1, degree + 1) for m in range(-n, n + 1)])
+
+
 def spz_of(version: int, count: int = 100, degree: int = 1) -> tuple[bytes, dict[str, np.ndarray]]:
     """A file of a version, and its values in the axes of the PLY, written from the format's description."""
     rng = np.random.default_rng(version)
@@ -125,7 +132,7 @@ def spz_of(version: int, count: int = 100, degree: int = 1) -> tuple[bytes, dict
         positions = (fixed / 4096).astype("<f2").tobytes()
     else:
         positions = b"".join(int(v).to_bytes(3, "little", signed=True) for v in fixed.ravel())
-    if version == 3:
+    if version >= 3:
         words = []
         for q in quats:
             largest, word = int(np.abs(q).argmax()), 0
@@ -136,29 +143,36 @@ def spz_of(version: int, count: int = 100, degree: int = 1) -> tuple[bytes, dict
     else:
         quats = quats * np.where(quats[:, 3:] < 0, -1, 1)
         turns = np.rint(quats[:, :3] * 127.5 + 127.5).astype(np.uint8).tobytes()
-    header = struct.pack("<IIIBBBB", MAGIC, version, count, degree, 12, 0, 0)
-    parts = [alphas.tobytes(), colors.tobytes(), scales.tobytes(), turns, rest.tobytes()]
-    return gzip.compress(header + positions + b"".join(parts)), {
+    parts = [positions, alphas.tobytes(), colors.tobytes(), scales.tobytes(), turns]
+    parts += [rest.tobytes()] if degree else []
+    if version == 4:  # with an extension, which is skipped
+        packed = [zstandard.compress(part) for part in parts]
+        header = struct.pack("<IIIBBBBI12x", MAGIC, version, count, degree, 12, 2, len(parts), 48) + bytes(16)
+        table = [struct.pack("<QQ", len(short), len(part)) for short, part in zip(packed, parts, strict=True)]
+        data = header + b"".join(table + packed)
+    else:
+        data = gzip.compress(struct.pack("<IIIBBBB", MAGIC, version, count, degree, 12, 0, 0) + b"".join(parts))
+    return data, {
         "means": fixed / 4096 * [1, -1, -1],
         "opacity": alphas[:, 0] / 255,
         "log_scales": scales / 16.0 - 10,
         "quats": quats[:, [3, 0, 1, 2]] * [1, 1, -1, -1],
-        "first": (rest.reshape(count, k, 3)[:, 0] - 128.0) / 128 * -1,  # y: odd in y
+        "rest": (rest.reshape(count, k, 3) - 128.0) / 128 * turned(degree)[:, None],
     }
 
 
-@pytest.mark.parametrize("version", [1, 2, 3])
-def test_spz_of_every_version(tmp_path: Path, version: int) -> None:
-    data, wanted = spz_of(version)
+@pytest.mark.parametrize(("version", "degree"), [(1, 1), (2, 2), (3, 3), (4, 0), (4, 4)])
+def test_spz_of_every_version(tmp_path: Path, version: int, degree: int) -> None:
+    data, wanted = spz_of(version, degree=degree)
     (tmp_path / "a.spz").write_bytes(data)
     splat = read_splat(tmp_path / "a.spz")
     assert np.allclose(splat.means, wanted["means"], atol=3e-3 if version == 1 else 1e-6)
     assert np.allclose(1 / (1 + np.exp(-splat.opacity_logits)), wanted["opacity"], atol=1e-5)
     assert np.allclose(splat.log_scales, wanted["log_scales"])
-    assert np.allclose(splat.sh[:, 1], wanted["first"])
+    assert np.allclose(splat.sh[:, 1:], wanted["rest"])
     assert all(array.flags.c_contiguous and array.dtype == np.float32 for array in splat.arrays().values())
     cosine = np.abs((splat.quats * wanted["quats"]).sum(axis=1)) / np.linalg.norm(splat.quats, axis=1)
-    assert cosine.min() > (0.9999 if version == 3 else 0.99)  # w is the root of what three rounded squares leave
+    assert cosine.min() > (0.9999 if version >= 3 else 0.99)  # w is the root of what three rounded squares leave
 
 
 def refused(path: Path) -> str:
@@ -190,11 +204,15 @@ def test_what_is_no_splat_is_told(tmp_path: Path) -> None:
 
 
 def test_spz_that_cannot_be_read_is_told(tmp_path: Path) -> None:
-    good = gzip.decompress(spz_of(2)[0])
+    good, packed = gzip.decompress(spz_of(2)[0]), spz_of(4)[0]
     file = tmp_path / "a.spz"
     for data, words in (
         (gzip.compress(struct.pack("<II", MAGIC, 7) + good[8:]), "of version 7"),
-        (struct.pack("<II", MAGIC, 4) + bytes(24), "of version 4"),
+        (struct.pack("<II", MAGIC, 5) + bytes(24), "of version 5"),
+        (packed[:8] + struct.pack("<I", 99) + packed[12:], "not of the size"),
+        (packed[:100], "cannot be read"),
+        (packed[:-50], "is cut short"),
+        (packed[:150] + b"\xff" * 50 + packed[200:], "cannot be read"),
         (gzip.compress(good[:-100]), "is cut short"),
         (gzip.compress(b"x" * 64), "is no .spz file"),
         (b"no gzip", "cannot be read"),
