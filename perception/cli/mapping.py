@@ -112,7 +112,10 @@ _SHORTCUTS = {
     "train.budget": ("N", "most Gaussians the map may have"),
     "train.iterations": ("N", None),
     "train.time_limit": ("S", "seconds of training; all schedules shrink to fit"),
-    "photos.memory": ("SIZE", "such as 8G: memory for photos, labels and depth; what does not fit is on disk"),
+    "photos.memory": (
+        "SIZE",
+        "such as 8G: for photos, labels and depth; more of them is on disk; of a splat: for the run",
+    ),
     "photos.holdout": ("N", "every N-th view, or the input's test part, is kept for scoring, 0 trains on all"),
     "seed": ("S", None),
     "device": ("DEVICE", "auto, cpu or cuda"),

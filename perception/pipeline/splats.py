@@ -17,6 +17,7 @@ from perception.gaussians.views import surface_depth
 from perception.machine import require_memory, return_free_memory
 from perception.masks import MaskSource
 from perception.pipeline.checkpoint import FeatureCheckpoints, frames_folder
+from perception.pipeline.estimate import image_memory
 from perception.pipeline.optimise import Optimised, Photos, Run, label_by_tasks, label_photos
 from perception.sfm.options import ReadOptions
 from perception.splats.features import new_features, train_features
@@ -26,8 +27,9 @@ from perception.splats.scene import drawn, splat_scene
 from perception.splats.surface import floaters
 from perception.types import Scene, View
 
-BASE_BYTES, BYTES_PER_GAUSSIAN = 1 << 30, 900
+BASE_BYTES, BYTES_PER_GAUSSIAN = 3 << 29, 900
 """Of a run: program, views and votes; all tables of a Gaussian with harmonics of degree 3."""
+LESS = "crop the scene, or use a machine with more memory"
 REFUSED = {
     "frame.known_length": "--known-length",
     "frame.tag_size": "--tag-size",
@@ -71,7 +73,8 @@ class SplatInput:
 
 
 def open_splat(source: Path, config: MapConfig) -> SplatInput | None:
-    """The splat that `source` is, None for another input. InputError for settings that do not go with the input."""
+    """The splat that `source` is, None for another input. InputError for settings that do not go with the input, and
+    for more Gaussians than `photos.memory`, or the memory of the machine, is enough for."""
     given = config.splat
     if not is_splat(source):
         for name in ("cameras", "up", "unit"):
@@ -85,11 +88,16 @@ def open_splat(source: Path, config: MapConfig) -> SplatInput | None:
             raise InputError(f"{option}: does not go with a finished splat; {todo or 'leave it out'}")
     if given.up is not None:
         direction(given.up)
-    splat = read_splat(source)
-    needed = BASE_BYTES + len(splat) * BYTES_PER_GAUSSIAN
-    require_memory(needed, f"{source}: {len(splat)} Gaussians", "crop the scene, or use a machine with more memory")
+    splat = read_splat(source, partial(_check_memory, source, config))
     hidden = floaters(splat)
     return SplatInput(splat, hidden, drawn(splat, hidden, new_features(len(splat), config)))
+
+
+def _check_memory(source: Path, config: MapConfig, count: int) -> None:
+    needed, what, given = BASE_BYTES + count * BYTES_PER_GAUSSIAN, f"{source}: {count} Gaussians", config.photos.memory
+    if needed > image_memory(config, None):
+        raise InputError(f"{what}: need about {needed / 2**30:.1f} GiB, --memory is {given}; give more, or {LESS}")
+    require_memory(needed, what, LESS)
 
 
 def unchanged(splat: SplatInput | None, arrays: dict[str, Any]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ rot_*               quaternion wxyz of any length        none: no rotation
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -30,8 +30,8 @@ LINEAR_SHARE = 0.05
 """Median of exp(scale), relative to the extent of the scene, above which positive scales are no logarithms."""
 FLAT = 1e-3
 """Thickness of a disc relative to its smaller σ."""
-PARKED = -100.0
-"""Logit of the opacity of rows that are not numbers: never drawn."""
+PARKED = -80.0
+"""Logit of the opacity of rows that are not numbers: never drawn, and e^80 is a float32."""
 CHUNK = 256
 """Gaussians that share the bounds of one row of `chunk` in a compressed PLY."""
 _REFUSED = "expected the properties of a Gaussian splat (x y z, opacity, scale_*, rot_*, f_dc_*)"
@@ -64,16 +64,18 @@ def is_splat(source: Path) -> bool:
     return source.suffix.lower() in SUFFIXES and source.is_file()
 
 
-def read_splat(path: Path) -> Splat:
-    """The Gaussians of a file, row for row. InputError for a mesh, a cloud of points, too few Gaussians, an unknown
-    version, and a damaged file."""
+def read_splat(path: Path, check: Callable[[int], None] = lambda count: None) -> Splat:
+    """The Gaussians of a file, row for row. check: is given their number before they are in memory. InputError for a
+    mesh, a cloud of points, too few Gaussians, an unknown version, and a damaged file."""
     if path.suffix.lower() == ".spz":
-        stored = read_spz(path)
+        stored = read_spz(path, check)
         means, quats, log_scales, logits, sh = (np.ascontiguousarray(stored[name]) for name in NAMES)
         splat = Splat(means, quats, log_scales, logits, sh)
     else:
         rows = _ply_rows(path)
-        _check_count(path, len(next(iter(rows.values()))))
+        count = len(next(iter(rows.values())))
+        _check_count(path, count)
+        check(count)
         splat = _compressed(rows) if "packed_position" in rows else _plain(path, rows)
     _check_count(path, len(splat))
     return _parked(path, splat)

@@ -18,6 +18,7 @@ from __future__ import annotations
 import gzip
 import struct
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -32,9 +33,10 @@ FLIPS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1, -1, 1, -1
 _EXPECTED = "expected a .spz file of version 1 to 4"
 
 
-def read_spz(path: Path) -> dict[str, np.ndarray]:
+def read_spz(path: Path, check: Callable[[int], None]) -> dict[str, np.ndarray]:
     """means [N, 3], quats [N, 4] wxyz, log_scales [N, 3], opacity_logits [N] and sh [N, K, 3] float32, with the axes of
-    a 3DGS PLY. InputError for another version, and for a file that is damaged or none."""
+    a 3DGS PLY. check: is given N before these arrays are made. InputError for another version, and for a file that is
+    damaged or none."""
     try:
         data = path.read_bytes()
         plain = data[:4] == struct.pack("<I", MAGIC)
@@ -54,6 +56,7 @@ def read_spz(path: Path) -> dict[str, np.ndarray]:
     if len(streams) < count * sum(widths):
         whole = len(streams) // sum(widths)
         raise InputError(f"{path}: is cut short: holds {whole} of the {count} Gaussians of its header; copy it anew")
+    check(count)
     parts, at = [], 0
     for width in widths:
         parts.append(np.frombuffer(streams, np.uint8, count * width, at).reshape(count, width))
