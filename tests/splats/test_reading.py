@@ -176,6 +176,17 @@ def test_spz_of_every_version(tmp_path: Path, version: int, degree: int) -> None
     assert cosine.min() > (0.9999 if version >= 3 else 0.99)  # w is the root of what three rounded squares leave
 
 
+def test_the_number_of_gaussians_is_told_before_they_are_read(tmp_path: Path) -> None:
+    (tmp_path / "a.spz").write_bytes(spz_of(3)[0])
+    for path, number in ((write(tmp_path / "a.ply", columns()), COUNT), (tmp_path / "a.spz", 100)):
+
+        def check(count: int, number: int = number) -> None:
+            raise MemoryError if count == number else AssertionError
+
+        with pytest.raises(MemoryError):
+            read_splat(path, check)
+
+
 def refused(path: Path) -> str:
     with pytest.raises(InputError) as error:
         read_splat(path)
