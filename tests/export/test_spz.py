@@ -56,7 +56,7 @@ def test_the_flipped_scene_seen_from_the_flipped_camera_is_the_same_picture() ->
     """Signs of rotations and harmonics: against the rasterizer, with the values before they are rounded."""
     gmap, turn = a_map(3, 0.8, 60), np.diag([1.0, -1, -1, 1])
     quats = gmap.quats * np.array([1, 1, -1, -1], np.float32)
-    sh = gmap.sh * np.concatenate([[1], FLIPS]).astype(np.float32)[:, None]
+    sh = gmap.sh * np.concatenate([[1], FLIPS[:15]]).astype(np.float32)[:, None]
     pose = np.eye(4)
     pose[2, 3] = 3.0
     K = torch.tensor([[[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]])

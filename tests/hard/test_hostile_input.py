@@ -62,7 +62,7 @@ def scene(n: int, dtype: Any, size: int = 8) -> Any:
 
 def backward(kind: str, inputs: Any, frames: Any, images: Any, depths: np.ndarray | None = None) -> None:
     cotangents = getattr(_core, f"RasterizerCotangents_{kind}")(None, None, depths, None, None)
-    gradients = getattr(_core, f"RasterizerGradients_{kind}")(*[None] * 8)
+    gradients = getattr(_core, f"RasterizerGradients_{kind}")(*[None] * 9)
     getattr(_core, f"rasterize_backward_{kind}")(inputs, frames, images, cotangents, gradients, False)
 
 

@@ -129,7 +129,8 @@ def _rasterize(dice: Dice, spoil: Callable[[dict[str, Any]], None]) -> list[Call
     grads = {f"g_{name}": None if a is None else np.ones_like(a) for name, a in images.items()}
     wanted = {f"d_{name}": guarded(a.shape, dtype) for name, a in list(arguments.items())[:7]
               if isinstance(a, np.ndarray)}  # fmt: skip
-    wanted = {"d_features": None, **wanted, "d_mean2d": guarded((cameras, n, 2), dtype)}
+    pulls = {f"d_{name}": guarded((cameras, n, 2), dtype) for name in ("mean2d", "absgrad")}
+    wanted = {"d_features": None, **wanted, **pulls}
     if dice.below(3) == 0:
         wanted = {name: array if name == "d_features" else None for name, array in wanted.items()}
     backward = {"inputs": inputs, "frames": frames, **images, **grads, **wanted, "stored": bool(dice.below(2))}
