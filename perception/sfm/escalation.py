@@ -10,6 +10,7 @@ import time
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import permutations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -46,9 +47,10 @@ DOUBT = 4
 """Photos are not added if over 1/DOUBT of the matched pairs between them and the others contradict their poses."""
 MOVED = 0.05
 """Nor if this moves the photos registered before, in the median and relative to their mean distance from the centre."""
-SHARED = 30
+SHARED, PARTNERS, EACH = 30, 3, 10
 """Least number of points that a photo shares with two others: points of two photos alone leave a chain's scale open.
-Right photos had 43 or more, a wrong one at the end of a chain 25."""
+Least number of photos with EACH of which it shares so many points. Right photos shared 43 and had 3 such photos, wrong
+ones at the end of a chain shared 25 and 40, and one had 2."""
 CANDIDATES = 4
 """Models mapped anew of which the best is used; two from all pairs, two from the stronger ones."""
 HELD = 0.5, 0.2
@@ -342,7 +344,10 @@ def _contradicted(model: Any, store: FeatureStore, joined: bool) -> set[int]:
 
 
 def _loose(model: Any) -> set[int]:
-    """Photos of a model that share less than SHARED points with two others."""
-    tracks = [point.track.elements for point in model.points3D.values() if point.track.length() > 2]
-    shared = Counter(element.image_id for track in tracks for element in track)
-    return {image for image in model.reg_image_ids() if shared[image] < SHARED}
+    """Photos of a model that share less than SHARED points with two others, or too few with a third."""
+    tracks = [sorted({each.image_id for each in point.track.elements}) for point in model.points3D.values()]
+    shared = Counter(image for track in tracks if len(track) > 2 for image in track)
+    common = Counter(pair for track in tracks for pair in permutations(track, 2))
+    partners = Counter(image for (image, _), count in common.items() if count >= EACH)
+    least = min(PARTNERS, model.num_reg_images() - 1)
+    return {image for image in model.reg_image_ids() if shared[image] < SHARED or partners[image] < least}

@@ -203,3 +203,17 @@ def test_photos_are_loose_that_share_few_points_with_two_others(points: int, loo
     options.num_points3D = points  # each seen by all four photos
     model = pycolmap.synthesize_dataset(options)
     assert _loose(model) == loose
+
+
+def test_a_photo_that_only_two_others_hold_is_loose() -> None:
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 6
+    options.num_points3D = 80
+    model = pycolmap.synthesize_dataset(options)
+    assert _loose(model) == set()
+    numbers, gone = sorted(model.points3D), {2: (4, 5, 6), 1: (1,)}  # half are seen by 1, 2, 3, the others by 2 to 6
+    for number, images in [(n, gone[2] if k < 40 else gone[1]) for k, n in enumerate(numbers)]:
+        seen = [(each.image_id, each.point2D_idx) for each in model.points3D[number].track.elements]
+        for image, index in [each for each in seen if each[0] in images]:
+            model.delete_observation(image, index)
+    assert _loose(model) == {1}
