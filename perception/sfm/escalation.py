@@ -101,8 +101,9 @@ class Escalation:
         """The best candidate; of each step its name, the photos registered after it, and seconds."""
         names, few = self.best.store.names, len(self.best.store.names) <= REPEATABLE_PHOTOS
         steps: list[dict[str, Any]] = [{"step": "at once", "registered": len(self.best.registered)}]
-        tries = {"more features": self._grow, **({"mapping anew": self._anew} if few else {})}
-        tries |= {"comparing photos": self._compare, "joining models": self._join}
+        tries = {"more features": self._grow}
+        tries |= {"mapping anew": self._anew, "comparing photos": self._compare} if few else {}
+        tries |= {"joining models": self._join}
         tries |= {"global mapping": self._global} if few else {}
         for name, attempt in tries.items():
             registered, started = len(self.best.registered), time.perf_counter()
