@@ -8,6 +8,7 @@ import struct
 import sys
 import zipfile
 from pathlib import Path
+from threading import Lock
 from typing import IO, Any
 
 import numpy as np
@@ -22,6 +23,9 @@ _DENSEST = 1032
 """Most bytes that a byte of deflate's code can stand for."""
 _MOST_HEADER = 1 << 16
 _PIECE = 1 << 20  # bytes that are unpacked at a time
+_ONE_HEADER = Lock()
+"""NumPy reads a header by `ast.literal_eval`, which in Python 3.11 fails now and then where two threads call it ("AST
+constructor recursion depth mismatch"): a good map would be called damaged."""
 
 
 def read_npz(source: Path | bytes, file: Path, advice: str) -> dict[str, np.ndarray]:
@@ -87,7 +91,9 @@ def _header(stream: IO[bytes], size: int) -> tuple[tuple[int, ...], bool, np.dty
     (wanted,), left = struct.unpack(width, length), size - stream.tell()
     if wanted > min(left, _MOST_HEADER):
         raise ValueError(f"an array header of {wanted} bytes, {left} are there")
-    shape, fortran, dtype = read(io.BytesIO(length + stream.read(wanted)))
+    header = io.BytesIO(length + stream.read(wanted))
+    with _ONE_HEADER:
+        shape, fortran, dtype = read(header)
     if dtype.hasobject or dtype.itemsize == 0 or dtype.fields is not None or dtype.subdtype is not None:
         raise ValueError(f"an array of {dtype}")
     needed, left = math.prod(shape) * dtype.itemsize, left - wanted
