@@ -24,10 +24,11 @@ def both_passes(inputs, device, dtype):
     out = module.rasterize_forward(given, settings)
     images = [getattr(out, name) for name in IMAGES]
     waves = [torch.sin(torch.arange(t.numel(), dtype=torch.float64)).view(t.shape).to(t) for t in images]
-    gradients = Gradients.zeros(given, EVERY_GRADIENT)
+    wanted = (*EVERY_GRADIENT, "absgrad")
+    gradients = Gradients.zeros(given, wanted)
     cotangents = Cotangents(**dict(zip(IMAGES, waves, strict=True)))
     module.rasterize_backward(given, settings, out, cotangents, gradients)
-    grads = [getattr(gradients, name) for name in EVERY_GRADIENT]
+    grads = [getattr(gradients, name) for name in wanted]
     return [t.cpu() for t in (*images, out.radii, out.visible, *grads)]
 
 
