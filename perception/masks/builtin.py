@@ -14,7 +14,7 @@ from perception.geometry import move_points
 from perception.io.memory import Keep
 from perception.masks.base import LoadImage, MaskSource
 from perception.masks.boundaries import WEIGHTS, boundaries, read_layers
-from perception.masks.cues import filled
+from perception.masks.cues import filled, photo_cues
 from perception.masks.merging import Segmentation, segmentation
 from perception.masks.stereo import StereoView, make_stereo_view, measure_depths
 from perception.masks.surface import FOOTPRINTS, Surface, SurfaceBuilder
@@ -22,9 +22,11 @@ from perception.masks.surface_graph import SurfaceGraph, patches, voxel_edges
 from perception.progress import QUIET, Progress
 from perception.types import View
 
-VERSION = 14  # increased whenever the label images change, so that cached ones are recomputed
+VERSION = 15  # increased whenever the label images change, so that cached ones are recomputed
 _SMOOTH = 0.03  # relative to the depth: a pixel with a larger depth step is not part of the surface
 _LEAST_VOXELS = 100
+_BAND = 2  # pixels to either side of where segments meet, between which their border may move; half a voxel
+_LEARNED = 15.0  # of a certain learned border, in the unit of the photo's gradient (Lab)
 
 
 class BuiltinSegmentation(MaskSource):
@@ -41,8 +43,7 @@ class BuiltinSegmentation(MaskSource):
                 "opencv-contrib-python-headless; uninstall the other and install that one again"
             )
         self.name, self.identity = "builtin", f"builtin {VERSION}"
-        self._voxels: dict[str, np.ndarray] = {}  # of each photo, [h, w] the voxel that each pixel shows, −1 = none
-        self._segment = np.zeros(0, np.int32)
+        self._labels: dict[str, np.ndarray] = {}  # of each photo, [h, w] the segment that each pixel shows, 0 = none
 
     def prepare(
         self,
@@ -62,21 +63,39 @@ class BuiltinSegmentation(MaskSource):
         if len(surface) < _LEAST_VOXELS:
             return None
         cuts = segmentation(surface_graph(stereo, surface))
-        self._segment, self._voxels = cuts.segment, {view.name: view.voxel for view in stereo}
+        self._labels = {view.name: keep(labels_of(view, cuts.segment)) for view in stereo}
         return cuts
 
     def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
         """[H, W] int32 labels of `photo` [H, W, 3], after `prepare`. All 0 if the photo does not show the surface."""
         import cv2
 
-        if view.name not in self._voxels:
+        if view.name not in self._labels:
             return np.zeros(photo.shape[:2], np.int32)
-        voxel = self._voxels[view.name]
-        labels = np.where(voxel >= 0, self._segment[voxel], 0)
-        known = labels > 0
-        if known.any():  # pixels off the surface take the nearest segment in the image
-            labels = filled(labels, known)
-        return cv2.resize(labels, photo.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+        return cv2.resize(self._labels[view.name], photo.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+
+
+def labels_of(view: StereoView, segment: np.ndarray) -> np.ndarray:
+    """[h, w] int32 segment of each pixel; 0 everywhere if the photo shows none. segment: [V] of each voxel.
+
+    Voxels are wider than pixels, and stereo is wrong next to things. So a pixel knows its segment only where others
+    confirm its depth and no other segment is within _BAND pixels. Segments grow from there to the borders of the photo,
+    and to the learned ones, by a watershed (Meyer 1991).
+    """
+    import cv2
+    from skimage.segmentation import watershed
+
+    labels = np.where(view.voxel >= 0, segment[view.voxel], 0).astype(np.int32)
+    if not (labels > 0).any():
+        return labels
+    labels = filled(labels, labels > 0)  # pixels off the surface take the nearest segment in the image
+    window = np.ones((2 * _BAND + 1, 2 * _BAND + 1), np.uint8)
+    image = labels.astype(np.float32)
+    inside = view.confirmed & (cv2.dilate(image, window) == cv2.erode(image, window))
+    seeds = np.where(inside | ~np.isin(labels, labels[inside]), labels, 0)  # a segment too thin for it stays
+    learned = 1 / (1 + np.exp(-view.learned[:2].max(axis=0).astype(np.float32)))
+    gradient = np.expm1(photo_cues(view.photo).texture) + _LEARNED * learned
+    return np.asarray(watershed(gradient, seeds), np.int32)
 
 
 def fuse(views: list[StereoView], side: float = FOOTPRINTS, weights: Path = WEIGHTS) -> Surface:

@@ -14,7 +14,7 @@ import pytest
 from perception.errors import InputError
 from perception.geometry import move_points
 from perception.masks import compute_masks, load_labels, make_source
-from perception.masks.builtin import BuiltinSegmentation, fuse, surface_graph
+from perception.masks.builtin import BuiltinSegmentation, fuse, labels_of, surface_graph
 from perception.masks.cues import depth_cues
 from perception.masks.merge_features import PAIR_FEATURES, pair_features
 from perception.masks.merging import (
@@ -108,6 +108,29 @@ def rough(depth: np.ndarray, seed: int) -> np.ndarray:
 def stereo_views() -> list[StereoView]:
     made = [make_stereo_view(view, photo, rough(depth, i)) for i, (view, photo, depth, _) in enumerate(world())]
     return [shown for shown in made if shown is not None]
+
+
+def test_borders_of_labels_are_those_of_the_photo():
+    """A disc whose labels come in blocks of four pixels, and reach too far where no photo confirms the depth."""
+    y, x = np.mgrid[:96, :128]
+    distance = np.hypot(y - 44.3, x - 60.7)
+    truth = np.where(distance < 25, 2, 1)
+    truth[8:12, 8:40] = 3  # so thin that nothing of it is far from its border
+    tint = np.array([(60, 90, 130), (150, 60, 50), (200, 200, 60)])[truth - 1]
+    photo = (tint + np.random.default_rng(0).integers(0, 12, tint.shape)).astype(np.uint8)
+    rough = np.kron(truth[2::4, 2::4], np.ones((4, 4), np.int64))
+    far = (distance < 32) & (x > 60)
+    rough[far] = 2
+    blank = np.zeros(truth.shape)
+    view = StereoView("a", photo, photo[..., 0], K, np.eye(4), blank, blank, blank, ~far)
+    view.voxel, view.learned = np.where(far, -1, rough).astype(np.int32), np.full((3, 96, 128), -9, np.float16)
+    labels = labels_of(view, np.arange(4))
+    assert labels.dtype == np.int32
+    assert np.mean(rough != truth) > 0.05
+    assert np.mean(labels != truth) < 0.005
+    assert np.mean(labels[truth == 3] == 3) > 0.95
+    view.voxel[:] = -1
+    assert not labels_of(view, np.arange(4)).any()
 
 
 @pytest.mark.slow
