@@ -30,6 +30,7 @@ def register(commands: Any) -> None:
 
     p = command(commands, "demo", _demo, "photos -> SfM -> map -> export -> text query, on photos that come with it")
     p.add_argument("-o", "--output", type=Path, default=Path("perception-demo"), metavar="DIR")
+    p.add_argument("--seed", type=int, default=0, metavar="N", help="of all random choices (default 0)")
 
     p = command(commands, "calibrate", _calibrate, "a camera file from photos or a video of a calibration board")
     p.add_argument("input", type=Path, metavar="INPUT", help="a folder of photos, or a video")
@@ -211,7 +212,7 @@ def _demo(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.pipeline.demo import run_demo
 
     with _sigterm_as_interrupt(), Progress() as progress:
-        return run_demo(args.output, progress)
+        return run_demo(args.output, progress, args.seed)
 
 
 def _calibrate(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

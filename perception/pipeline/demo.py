@@ -56,7 +56,7 @@ class DemoTruth:
         return cls(facts["asked"], dict(facts["queries"]), names, facts["centres"], points, ids)
 
 
-def run_demo(output: Path, progress: Progress) -> tuple[dict[str, Any], str]:
+def run_demo(output: Path, progress: Progress, seed: int = 0) -> tuple[dict[str, Any], str]:
     """Photos → SfM → masks → map → export → queries, all in `output`; returns figures and a text."""
     started = time.monotonic()
     check_empty(output)
@@ -64,7 +64,7 @@ def run_demo(output: Path, progress: Progress) -> tuple[dict[str, Any], str]:
     shutil.copytree(SCENE / "photos", photos)
     truth = DemoTruth.read()
 
-    build_map(photos, map_path, load_config(None, SETTINGS), progress=progress)
+    build_map(photos, map_path, load_config(None, [*SETTINGS, f"seed={seed}"]), progress=progress)
     gmap = load_map(map_path)
 
     cloud, scale = truth_in_map_frame(truth, gmap)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from perception.masks.merging import REGION_COLUMNS, MergeTree
-from score.segments import best_iou, joined_by, union_iou
+from score.segments import best_iou, joined_by, share_passed, union_iou
+from training.masks import Reading
 
 # Voxels of each patch by thing; 0 is unknown. Thing 4 lies in a patch that is mostly of thing 3.
 VOTES = np.array(
@@ -34,3 +35,13 @@ def test_what_joins_two_things(odds: float, cause: str) -> None:
     assert joined_by(VOTES, tree, together, things) == {"patches": 1, "network": 0, "cut": 0} | {cause: 1}
     apart = np.stack([VOTES[:2].sum(axis=0), VOTES[2], VOTES[3:5].sum(axis=0), VOTES[5]])
     assert joined_by(VOTES, tree, apart, things) == {"patches": 1, "network": 0, "cut": 0}
+
+
+def test_share_of_thresholds_by_hand() -> None:
+    """Two labels of two things, each with pixels of the other; a third thing is tiny and does not count."""
+    ids, labels = np.ones((40, 40), np.int64), np.ones((40, 40), np.int64)
+    ids[:15], labels[:11], labels[11, :10], labels[30, :], labels[31, :10] = 2, 2, 2, 2, 2
+    ids[39, :5] = 3
+    reading = Reading([], [ids], 4.0, [])
+    # IoU of thing 2: 450 / (600 + 50), above .5 to .65; of thing 1: 945 / (995 + 155), above .5 to .8
+    assert share_passed(reading, [labels]) == pytest.approx((4 + 7) / 20)

@@ -1,12 +1,14 @@
 """Says where the built-in masks lose things: in patches, in the order of merges, or in the cut.
 
-python tools score.segments SCENE...
+python tools score.segments [--depth] SCENE...
 
 Scenes are those of docs/benchmarks.md, read by stereo as in `training.masks`, without training a map. A thing is found
 where a union of patches, a region of the tree, a region of the cut, or a segment has an IoU above 0.5 with it, in
 voxels. Two things are joined where one segment holds more than half of each: by patches, if more than half of the
 smaller one lies in patches that are mostly of other things; else by the networks, if the first region with half of each
-comes from a merge of odds above even; else by the cut.
+comes from a merge of odds above even; else by the cut. Last, the share of THRESHOLDS of IoU that the best label of each
+thing passes, pixels of all photos together: of labels as their voxels are, and as their borders moved to the photos'.
+--depth: depth as of a camera.
 """
 
 from __future__ import annotations
@@ -19,18 +21,22 @@ from typing import Any
 import numpy as np
 
 from perception.bench.output import Column, table
+from perception.masks.builtin import labels_of
+from perception.masks.cues import filled
 from perception.masks.merging import REGION_COLUMNS, MergeTree, divided, read_model, tree_by
 from perception.masks.surface import FOOTPRINTS
 from score.instances import read_scene as read_truth
 from support.mask_scores import leaf_sums
-from training.masks import LEAST, read_scene, world_of
+from training.masks import LEAST, Reading, read_scene, world_of
 
-FOUND = 0.5
+FOUND, THRESHOLDS, LEAST_PIXELS = 0.5, np.arange(0.5, 1, 0.05), 500
 STAGES, CAUSES = ("patches", "tree", "cut", "segments"), ("patches", "network", "cut")
 COLUMNS: tuple[Column, ...] = (
     ("things", "things", "d"),
     *((name, f"in_{name}", "d") for name in STAGES),
     *((f"joined by {name}", f"by_{name}", "d") for name in CAUSES),
+    ("voxel labels", "voxels", ".3f"),
+    ("labels", "labels", ".3f"),
 )
 
 
@@ -66,9 +72,27 @@ def joined_by(votes: np.ndarray, tree: MergeTree, segments: np.ndarray, things: 
     return counts
 
 
-def row_of(folder: Path) -> dict[str, Any]:
+def share_passed(reading: Reading, images: Sequence[np.ndarray]) -> float:
+    """Share of THRESHOLDS that the best label of each thing of LEAST_PIXELS passes. images: [h, w] labels of the views,
+    0 = none."""
+    shared = np.zeros((max(int(image.max()) for image in images) + 1, max(int(ids.max()) for ids in reading.ids) + 1))
+    for image, ids in zip(images, reading.ids, strict=True):
+        np.add.at(shared, (image, ids), 1)
+    sizes, shared[0], shared[:, 0] = shared.sum(axis=0), 0, 0
+    things = np.flatnonzero(sizes[1:] >= LEAST_PIXELS) + 1
+    return float((best_iou(shared, sizes)[things, None] > THRESHOLDS).mean())
+
+
+def of_voxels(voxel: np.ndarray, segment: np.ndarray) -> np.ndarray:
+    """[h, w] segment of each pixel's voxel, of the nearest pixel that has one where there is none."""
+    labels = np.where(voxel >= 0, segment[voxel], 0)
+    return filled(labels, labels > 0) if labels.any() else labels
+
+
+def row_of(folder: Path, stereo: bool) -> dict[str, Any]:
     """The line of one scene."""
-    world, model = world_of(read_scene(folder, stereo=True, side=FOOTPRINTS)), read_model()
+    reading = read_scene(folder, stereo, side=FOOTPRINTS)
+    world, model = world_of(reading), read_model()
     tree = tree_by(model, world.graph)
     segment, _ = divided(world.graph, tree, model)
     segments = np.zeros((int(segment.max()) + 1, world.votes.shape[1]))
@@ -84,14 +108,19 @@ def row_of(folder: Path) -> dict[str, Any]:
         "things": len(things),
         **{f"in_{name}": int((iou[things] > FOUND).sum()) for name, iou in zip(STAGES, ious, strict=True)},
         **{f"by_{name}": count for name, count in joined_by(votes, tree, segments, things).items()},
+        "voxels": share_passed(reading, [of_voxels(view.voxel, segment) for view in reading.views]),
+        "labels": share_passed(reading, [labels_of(view, segment) for view in reading.views]),
     }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path, nargs="+", metavar="SCENE")
-    rows = [row_of(folder) for folder in parser.parse_args().scenes]
-    rows.append({"place": "all", **{key: sum(row[key] for row in rows) for _, key, _ in COLUMNS}})
+    parser.add_argument("--depth", action="store_true", help="depth as of a camera, not by stereo")
+    options = parser.parse_args()
+    rows = [row_of(folder, stereo=not options.depth) for folder in options.scenes]
+    sums = {key: sum(row[key] for row in rows) for _, key, _ in COLUMNS}
+    rows.append({"place": "all", **sums, **{key: sums[key] / len(rows) for key in ("voxels", "labels")}})
     print(table(rows, COLUMNS, ("place",)))
 
 
