@@ -61,6 +61,7 @@ def test_nearest_points_are_found_in_pieces(ranks: list[int], monkeypatch: pytes
     assert sizes == [7, 7, 7, 7, 7, 5]
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_a_signal_waits_for_the_search_that_runs() -> None:
     """The threads of a search must not outlive it; the next piece is not begun."""
     done = []

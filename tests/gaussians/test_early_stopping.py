@@ -221,6 +221,7 @@ def test_the_time_between_two_legs_is_not_training(monkeypatch: pytest.MonkeyPat
     assert trainer.run(Clock()).seconds == trainer.record.iterations == 10
 
 
+@pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("how", ["interrupt", "failure"])
 def test_only_whole_steps_are_kept(monkeypatch: pytest.MonkeyPatch, how: str) -> None:
     """Half of the third step's tensors have moved: Ctrl-C takes effect after it, and a failure saves nothing."""
@@ -243,13 +244,9 @@ def test_only_whole_steps_are_kept(monkeypatch: pytest.MonkeyPatch, how: str) ->
         def after_leg(self, trainer: Trainer) -> None:
             saved.append(copy.deepcopy(trainer.state()))
 
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores SIGINT
-    try:
-        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt if how == "interrupt" else MemoryError):
-            patch.setattr(optimiser, "training_kernels", disturbed)
-            trainer.run(Saver())
-    finally:
-        signal.signal(signal.SIGINT, before)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt if how == "interrupt" else MemoryError):
+        patch.setattr(optimiser, "training_kernels", disturbed)
+        trainer.run(Saver())
     assert [state["iteration"] for state in saved] == ([3] if how == "interrupt" else [])
     for state in saved:
         resumed.load(state)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from pathlib import Path
 
@@ -21,16 +20,15 @@ except BaseException as error:  # what the import of a compiled module makes of 
 """
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_during_the_import_is_no_missing_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "onnxruntime.py").write_text(EXTENSION)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "onnxruntime", raising=False)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores SIGINT
     try:
         with pytest.raises(KeyboardInterrupt):
             open_session(tmp_path / "model.onnx")
     finally:
-        signal.signal(signal.SIGINT, before)
         sys.modules.pop("onnxruntime", None)
 
 
