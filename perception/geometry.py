@@ -13,6 +13,7 @@ from perception.interrupts import uninterrupted
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
+    from torch import Tensor
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Camera axes: OpenGL (x right, y up, z backward) to OpenCV (x right, y down, z forward). Its own inverse."""
@@ -149,19 +150,22 @@ def sums_by(index: np.ndarray, values: np.ndarray, count: int, weights: np.ndarr
     return np.stack(sums, axis=1).astype(np.float64, copy=False).reshape(count, *values.shape[1:])  # int64 of no values
 
 
-def along_curve(points: np.ndarray) -> np.ndarray:
+def along_curve(points: Tensor) -> Tensor:
     """The order [P] int64 of points [P, 3] along a Morton curve (Morton 1966): most neighbours in space are near in it.
 
     The sides of a cell are shares of all points, not of space, so that far points do not crowd the others.
     """
-    code = np.zeros(len(points), np.int64)
+    import torch
+
+    order = torch.arange(len(points), device=points.device)
+    code = torch.zeros_like(order)
     for axis in range(3):
-        rank = np.empty(len(points), np.int64)
-        rank[np.argsort(points[:, axis], kind="stable")] = np.arange(len(points))
+        rank = torch.empty_like(order)
+        rank[torch.sort(points[:, axis], stable=True).indices] = order
         cell = rank * _CELLS // max(1, len(points))
         for bit in range(_CELLS.bit_length() - 1):
             code |= (cell >> bit & 1) << (3 * bit + axis)
-    return np.argsort(code, kind="stable")
+    return torch.sort(code, stable=True).indices
 
 
 def nearest(tree: cKDTree, points: np.ndarray, ranks: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:

@@ -6,6 +6,7 @@ import signal
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial import cKDTree
 
 from perception import geometry
@@ -31,14 +32,14 @@ def test_points_of_a_grid_are_ordered_by_their_interleaved_bits() -> None:
     cells = np.stack(np.meshgrid(*[np.arange(8)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     cells = np.random.default_rng(0).permutation(cells)
     codes = ["".join(f"{z:03b}"[bit] + f"{y:03b}"[bit] + f"{x:03b}"[bit] for bit in range(3)) for x, y, z in cells]
-    found = along_curve(np.exp(cells) * [1, 10, 0.1])  # only the order along each axis counts
+    found = along_curve(torch.from_numpy(np.exp(cells) * [1, 10, 0.1]))  # only the order along each axis counts
     assert [codes[n] for n in found] == sorted(codes)
-    assert len(along_curve(np.zeros((0, 3)))) == 0
+    assert len(along_curve(torch.zeros(0, 3))) == 0
 
 
 def test_values_that_are_not_finite_are_ordered_too() -> None:
-    points = np.array([[np.nan, 0, np.inf], [1, 2, 3], [-np.inf, 0, 0], [1, 2, 3]])
-    assert sorted(along_curve(points)) == [0, 1, 2, 3]
+    points = torch.tensor([[torch.nan, 0, torch.inf], [1, 2, 3], [-torch.inf, 0, 0], [1, 2, 3]])
+    assert sorted(along_curve(points).tolist()) == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("ranks", [[1], [9], range(1, 5)])

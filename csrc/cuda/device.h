@@ -89,8 +89,11 @@ struct Cotangents {
 };
 
 // dL/d(input), added to what is there; null where not wanted. camera: [N,12] each Gaussian's dL/dR, dL/dt.
+// stored: with respect to the logarithms of the scales and the logits of the opacities. fresh, fresh_features: what is
+// there is replaced, for the Gaussians with records; in the features, and in all else.
 struct Gradients {
   Results means, quats, scales, opacities, colors, features, camera, mean2d, absgrad;
+  int stored, fresh, fresh_features;
 };
 
 static __device__ inline T lower(T a, T b) { return a < b ? a : b; }
@@ -134,6 +137,16 @@ static __device__ inline bool touches(const Splat &s, T x, T y, T extent_x, T ex
   const T u1 = fma(s.k, best_y, near_x), u2 = fma(s.k, near_y, best_x);
   const T e1 = fma(s.a * u1, u1, s.d * best_y * best_y), e2 = fma(s.a * u2, u2, s.d * near_y * near_y);
   return higher(e1, e2) >= -s.reach;
+}
+
+// Adds the columns of the first `rows` rows to column 0, which thread 0 may read then.
+template <int ROWS>
+static __device__ inline void add_threads(SHARED(double) (&sums)[ROWS][kThreads], int rows) {
+  for (int half = kThreads / 2; half; half /= 2) {
+    __syncthreads();
+    if (threadIdx.x < half)
+      for (int j = 0; j < rows; ++j) sums[j][threadIdx.x] = sums[j][threadIdx.x] + sums[j][threadIdx.x + half];
+  }
 }
 
 // The pixel of this thread, in the tile of this block.

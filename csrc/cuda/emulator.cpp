@@ -25,6 +25,10 @@ std::map<std::string, Kernel> kernels = {
     {"forward_kernel", taking_pointers(perception::forward_kernel)},
     {"backward_kernel", taking_pointers(perception::backward_kernel)},
     {"reduce_kernel", taking_pointers(perception::reduce_kernel)},
+    {"prototype_parts_kernel", taking_pointers(perception::prototype_parts_kernel)},
+    {"prototype_kernel", taking_pointers(perception::prototype_kernel)},
+    {"spread_kernel", taking_pointers(perception::spread_kernel)},
+    {"separation_kernel", taking_pointers(perception::separation_kernel)},
     {"adam_kernel", taking_pointers(perception::adam_kernel)},
     {"ssim_kernel", taking_pointers(perception::ssim_kernel)},
     {"photometric_kernel", taking_pointers(perception::photometric_kernel)},
@@ -42,7 +46,7 @@ int emulator_struct_size(int which) {
   using namespace perception;
   const int sizes[] = {sizeof(Scene),  sizeof(Projection), sizeof(Strip),    sizeof(Lists),
                        sizeof(Images), sizeof(Cotangents), sizeof(Gradients),  sizeof(AdamRows),
-                       sizeof(Photo)};
+                       sizeof(Photo),  sizeof(Masks),      sizeof(Pairs)};
   return sizes[which];
 }
 

@@ -3,6 +3,7 @@
 // sum has one order, so the bits of images and gradients do not depend on timing.
 #include "backward.h"
 #include "forward.h"
+#include "instances.h"
 #include "prepare.h"
 #include "reduce.h"
 #include "training.h"

@@ -39,29 +39,27 @@ static __device__ inline ProjectedGrad<T> picture_gradient(const Splat &s, const
   return g;
 }
 
+static __device__ inline void add(Results out, Index row, const T *values, int n, bool fresh) {
+  if (out)
+    for (int c = 0; c < n; ++c) out[row * n + c] = (fresh ? T(0) : out[row * n + c]) + values[c];
+}
+
 // Colours, or harmonics and the direction they are seen from (which moves the mean and the camera).
 static __device__ inline void color_gradient(const Scene &scene, const Camera<T> &cam, Index i, const Splat &s,
-                                             const T *g_rgb, Results out, T *g_mean, T *g_R, T *g_t) {
-  if (scene.sh_degree < 0) {
-    if (out)
-      for (int c = 0; c < 3; ++c) out[3 * i + c] += g_rgb[c];
-    return;
-  }
+                                             const T *g_rgb, Results out, bool fresh, T *g_mean, T *g_R, T *g_t) {
+  if (scene.sh_degree < 0) return add(out, i, g_rgb, 3, fresh);
   T v[3], gv[3], gated[3];
   for (int c = 0; c < 3; ++c) gated[c] = s.rgb[c] > 0 ? g_rgb[c] : T(0);
   view_vector<T>(cam, scene.means + 3 * i, v);
   const Index row = 3 * i * scene.sh_stride;
   T *written = out ? static_cast<T *>(out + row) : nullptr;
+  if (out && fresh)
+    for (int c = 0; c < 3 * scene.sh_stride; ++c) out[row + c] = 0;
   sh_color_vjp<T>(scene.sh_degree, v, scene.colors + row, gated, written, gv);
   for (int c = 0; c < 3; ++c) {  // v = mean + Rᵀ t
     g_mean[c] += gv[c];
     for (int k = 0; k < 3; ++k) g_R[3 * k + c] += cam.t[k] * gv[c], g_t[k] += cam.R[3 * k + c] * gv[c];
   }
-}
-
-static __device__ inline void add(Results out, Index row, const T *values, int n) {
-  if (out)
-    for (int c = 0; c < n; ++c) out[row * n + c] += values[c];
 }
 
 // A thread a Gaussian, by depth: its records, then back to its own parameters and the camera. visible [N].
@@ -81,15 +79,22 @@ extern "C" __global__ void __launch_bounds__(kThreads)
   T g_mean[3], g_quat[4], g_scale[3], g_camera[12];  // dL/dR, dL/dt
   project_vjp<T>(cam, scene.means + 3 * i, scene.quats + 4 * i, scene.scales + 3 * i, g, g_mean, g_quat, g_scale,
                  g_camera, g_camera + 9);
-  color_gradient(scene, cam, i, s, r + 8, out.colors, g_mean, g_camera, g_camera + 9);
-  const T g_opacity = r[0] / scene.opacities[i], g_mean2d[2] = {g.x, g.y};
+  color_gradient(scene, cam, i, s, r + 8, out.colors, out.fresh, g_mean, g_camera, g_camera + 9);
+  const T opacity = scene.opacities[i], g_mean2d[2] = {g.x, g.y};
+  const T g_opacity = out.stored ? r[0] * (1 - opacity) : r[0] / opacity;
+  if (out.stored)
+    for (int c = 0; c < 3; ++c) g_scale[c] *= scene.scales[3 * i + c];
   const T size_x = r[6] * s.a * (-2 / kLog2E<T>), size_y = magnitude(s.k) * size_x + r[7] * s.d * (-2 / kLog2E<T>);
   const T absolute[2] = {size_x, size_y};  // see absolute_gradient of rasterizer/reduce.cpp
-  add(out.means, i, g_mean, 3), add(out.quats, i, g_quat, 4), add(out.scales, i, g_scale, 3);
-  add(out.opacities, i, &g_opacity, 1), add(out.camera, i, g_camera, 12), add(out.mean2d, i, g_mean2d, 2);
-  add(out.absgrad, i, absolute, 2);
+  const bool fresh = out.fresh;
+  add(out.means, i, g_mean, 3, fresh), add(out.quats, i, g_quat, 4, fresh), add(out.scales, i, g_scale, 3, fresh);
+  add(out.opacities, i, &g_opacity, 1, fresh), add(out.camera, i, g_camera, 12, fresh);
+  add(out.mean2d, i, g_mean2d, 2, fresh), add(out.absgrad, i, absolute, 2, fresh);
   if (out.features)
-    for (int c = 0; c < NF; ++c) out.features[i * scene.dims + c] += r[kMoments + c];
+    for (int c = 0; c < NF; ++c) {
+      const Index at = i * scene.dims + c;
+      out.features[at] = (out.fresh_features ? T(0) : out.features[at]) + r[kMoments + c];
+    }
 }
 
 }  // namespace perception

@@ -6,11 +6,11 @@
 
 namespace perception {
 
-// A tensor of `rows` rows of `width` numbers. rates: one a column, or null for `rate` in all. visible: null for all rows.
-// root: 1 / sqrt(1 - beta2^step); the rates are divided by 1 - beta1^step. skipped: rows that are not finite, added up.
+// A tensor of `rows` rows of `width` numbers. shares: of `rate`, one a column, or null for 1. visible: null for all rows.
+// root: 1 / sqrt(1 - beta2^step); the rate is divided by 1 - beta1^step. skipped: rows that are not finite, added up.
 struct AdamRows {
   Results param, first, second;
-  Reals grad, rates;
+  Reals grad, shares;
   GLOBAL(const unsigned char) visible;
   GLOBAL(int) skipped;
   int rows, width;
@@ -29,7 +29,7 @@ extern "C" __global__ void __launch_bounds__(kThreads) adam_kernel(AdamRows a) {
   const T g = a.grad[at], first = a.beta1 * a.first[at] + (1 - a.beta1) * g;
   const T second = a.beta2 * a.second[at] + (1 - a.beta2) * g * g;
   a.first[at] = first, a.second[at] = second;
-  a.param[at] -= (a.rates ? a.rates[at - begin] : a.rate) * first / (sqrt(second) * a.root + a.eps);
+  a.param[at] -= a.rate * (a.shares ? a.shares[at - begin] : T(1)) * first / (sqrt(second) * a.root + a.eps);
 }
 
 constexpr int kRadius = 5, kPatch = kTile + 2 * kRadius;
@@ -123,11 +123,7 @@ extern "C" __global__ void __launch_bounds__(kThreads) ssim_kernel(Photo photo) 
     l1 += share * (away < 0 ? -away : away), alike += share * ssim, unlike += share * (1 - ssim);
   }
   parts[0][threadIdx.x] = l1, parts[1][threadIdx.x] = alike, parts[2][threadIdx.x] = unlike;
-  for (int half = kThreads / 2; half; half /= 2) {
-    __syncthreads();
-    if (threadIdx.x < half)
-      for (int j = 0; j < 3; ++j) parts[j][threadIdx.x] = parts[j][threadIdx.x] + parts[j][threadIdx.x + half];
-  }
+  add_threads(parts, 3);
   if (threadIdx.x == 0)
     for (int j = 0; j < 3; ++j) photo.sums[3 * static_cast<Index>(blockIdx.x) + j] = parts[j][0];
 }

@@ -6,9 +6,10 @@ of others that do not see it, and it is a veil before photos taken between these
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
+import torch
 
 from perception.gaussians.densify import rotation_matrices
 from perception.gaussians.model import Gaussians
@@ -29,23 +30,42 @@ class FreeSpace:
         from scipy.spatial import cKDTree
 
         self._measured = cKDTree(points)
-        self._balls = [_ball(points, view) for view in views]
+        balls = [_ball(points, view) for view in views]
+        self._balls = [(center, radius) for center, radius in balls if radius > 0]
 
     def reached_by(self, gaussians: Gaussians) -> np.ndarray:
         """[N] bool: whether each Gaussian reaches, by a standard deviation, into the space around a camera, and was not
         measured there."""
-        means, scales = (tensor.cpu().double().numpy() for tensor in (gaussians.means, gaussians.scales))
-        widest, found = scales.max(axis=1), np.zeros(len(means), bool)
-        x, y, z = np.ascontiguousarray(means.T)
+        means, scales = gaussians.means.double(), gaussians.scales.double()
+        axes = rotation_matrices(gaussians.quats).double()
+        least = torch.full_like(means[:, 0], torch.inf)  # radius of the balls that each Gaussian reaches into
+        found = least < 0
+        for center, radius, near in self._near(gaussians):
+            away = torch.from_numpy(center).to(means) - means[near]
+            distance = away.square().sum(dim=1).sqrt()
+            toward = (away[:, :, None] * axes[near]).sum(dim=1) / distance.clamp(min=1e-9)[:, None]
+            extent = (scales[near] * toward).square().sum(dim=1).sqrt()  # standard deviation on the ray to the camera
+            reaching = distance - extent < radius
+            found[near[reaching & (extent > MEASURED * radius)]] = True
+            rows = near[reaching]
+            least[rows] = least[rows].clamp(max=radius)
+        asked = (least.isfinite() & ~found).nonzero()[:, 0]
+        bound = MEASURED * least[asked].cpu().numpy()
+        most = np.nextafter(bound.max(initial=0), np.inf)
+        away = self._measured.query(means[asked].cpu().numpy(), distance_upper_bound=most)[0]
+        found[asked] = torch.from_numpy(away > bound).to(found.device)
+        return found.cpu().numpy()
+
+    def _near(self, gaussians: Gaussians) -> Iterator[tuple[np.ndarray, float, torch.Tensor]]:
+        """Centre, radius, and the rows of the Gaussians that may reach into the ball, by their widest axes."""
+        middle = self._balls[0][0] if self._balls else np.zeros(3)
+        means = gaussians.means - torch.from_numpy(middle).to(gaussians.means)
+        squares, widest = means.square().sum(dim=1), gaussians.scales.amax(dim=1)
+        rounding = 1e-5 * squares
         for center, radius in self._balls:
-            distance = np.sqrt((x - center[0]) ** 2 + (y - center[1]) ** 2 + (z - center[2]) ** 2)
-            near = np.flatnonzero((distance - widest < radius) & (radius > 0) & ~found)
-            axes = rotation_matrices(gaussians.quats.cpu()[near]).double().numpy()
-            toward = ((center - means[near])[:, :, None] * axes).sum(axis=1) / np.maximum(distance[near], 1e-9)[:, None]
-            extent = np.sqrt(((scales[near] * toward) ** 2).sum(axis=1))  # standard deviation on the ray to the camera
-            measured = self._measured.query(means[near])[0] <= MEASURED * radius
-            found[near] = (distance[near] - extent < radius) & ~(measured & (extent <= MEASURED * radius))
-        return found
+            c = torch.from_numpy(center - middle).to(means)
+            within = torch.addmv(squares, means, c, alpha=-2) + c.square().sum() * (1 - 1e-5) - rounding
+            yield center, radius, (within < (widest + radius).square()).nonzero()[:, 0]
 
 
 def _ball(points: np.ndarray, view: TrainingView) -> tuple[np.ndarray, float]:

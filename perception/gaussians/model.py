@@ -22,6 +22,8 @@ def sigmoid(logits: torch.Tensor) -> torch.Tensor:
     torch.sigmoid depends on it above 32,768 elements: the last elements of each thread's part take another code path.
     Logits are clamped to ±80, where float32 still holds exp(x). Opacities near 1e-35 need no gradient.
     """
+    if logits.device.type != "cpu":
+        return torch.sigmoid(logits.clamp(-80, 80))  # two launches, not six
     return 1 / (1 + torch.exp(-logits.clamp(-80, 80)))
 
 

@@ -37,18 +37,19 @@ class SparseAdam:
         self._first = {name: torch.zeros_like(t) for name, t in self.params.items()}
         self._second = {name: torch.zeros_like(t) for name, t in self.params.items()}
 
-    def step(
-        self, rates: Mapping[str, Rate], grads: Mapping[str, Tensor | None], visible: Tensor | None = None
-    ) -> dict[str, int]:
+    def step(self, rates: Mapping[str, Rate], grads: Mapping[str, Tensor | None], visible: Tensor | None = None) -> int:
         """One step of the rows where visible [N] uint8 is not 0; None: of all. grads: name -> [N, ...].
 
         rates: name -> learning rate, or a tensor of one rate per column, shaped like a row ([...]): the constant term
         and the higher spherical harmonics share a tensor and have different rates.
         Tensors without a gradient are not updated; the global step count increases by one for all. Returns the number
-        of rows of each other one skipped for a gradient with NaN or infinity, as a tensor where it is not on the CPU.
+        of rows of the others skipped for a gradient with NaN or infinity, as a tensor where it is not on the CPU.
         """
         self.steps += 1
-        skipped = {}
+        device = next(iter(self.params.values())).device
+        # On a GPU one counter for all tensors: each zero and each sum would be a launch.
+        counter = {} if device.type == "cpu" else {"skipped": torch.zeros((), dtype=torch.int32, device=device)}
+        skipped = 0
         for name, param in self.params.items():
             grad = grads.get(name)
             if grad is None or not param.numel():
@@ -57,8 +58,9 @@ class SparseAdam:
             matrices = [tensor.view(len(param), -1) for tensor in tensors]
             rate = np.asarray(rates[name], dtype=np.float64).reshape(-1)
             rate = np.ascontiguousarray(np.broadcast_to(rate, matrices[0].shape[1]))
-            adam = training_kernels(param.device).adam
-            skipped[name] = adam(*matrices, visible, rate, self.steps, *BETAS, EPS)
+            adam = training_kernels(device).adam
+            found = adam(*matrices, visible, rate, self.steps, *BETAS, EPS, **counter)
+            skipped = found if counter else skipped + found
         return skipped
 
     def keep(self, index: Tensor) -> None:

@@ -146,7 +146,7 @@ class Trainer(TrainingState):
             for name, gradient in by_name.items():
                 if name != "sh" and gradient is not None:
                     gradient[: self.held] = 0
-        self.record.skipped_gradients += int(sum(self.optimiser.step(rates, by_name, visible).values()))
+        self.record.skipped_gradients += int(self.optimiser.step(rates, by_name, visible))
 
     def _losses(self, view: TrainingView, out: Forward) -> tuple[float, Cotangents]:
         """L (eq. 14) and its gradients with respect to the images."""

@@ -7,6 +7,7 @@ and a tile of 16 × 16 pixels is computed in strips of tile rows. Their gradient
 from __future__ import annotations
 
 import ctypes
+import functools
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -50,7 +51,11 @@ STRIP = structure("Strip", "splats boxes front_to_back ends", "n first_row end_r
 LISTS = structure("Lists", "ids slots starts")
 IMAGES = structure("Images", "colors alphas depths features variance visible")
 COTANGENTS = structure("Cotangents", "colors alphas depths features variance")
-GRADIENTS = structure("Gradients", "means quats scales opacities colors features camera mean2d absgrad")
+GRADIENTS = structure(
+    "Gradients",
+    "means quats scales opacities colors features camera mean2d absgrad",
+    "stored fresh fresh_features",
+)
 
 
 def filled(structure: Any, **values: Tensor | int | float | None) -> Any:
@@ -97,6 +102,7 @@ class _Call:
         self.blocks = (self.n + THREADS - 1) // THREADS
         self.tiles_x, self.tiles_y = ((size + TILE - 1) // TILE for size in (settings.width, settings.height))
         self.slices = range(0, max(self.dims, 1), MAX_FEATURES)  # of the feature channels, by the first of each
+        self.scene = functools.cache(self._scene)
 
     def kernels(self, begin: int) -> Kernels:
         """Those for the slice of the feature channels that starts at `begin`."""
@@ -105,7 +111,7 @@ class _Call:
         options = KernelOptions(width, s.variance and width > 0, s.depth and begin == 0, double)
         return device_kernels(options, self.means.device)
 
-    def scene(self, camera: int, begin: int = 0) -> Any:
+    def _scene(self, camera: int, begin: int) -> Any:
         of, s = self.inputs, self.settings
         return filled(
             SCENES[self.means.dtype],
@@ -127,7 +133,7 @@ class _Call:
         depths = self.means.new_full((self.n,), torch.inf)
         first_bad = self.means.new_full((1,), self.n, dtype=torch.int32)
         projection = filled(PROJECTION, splats=splats, boxes=boxes, depths=depths, radii=radii, first_bad=first_bad)
-        self.kernels(0).launch("project_kernel", self.blocks, self.scene(camera), projection)
+        self.kernels(0).launch("project_kernel", self.blocks, self.scene(camera, 0), projection)
         front_to_back = torch.sort(depths, stable=True).indices.to(torch.int32)
         view = {"splats": splats, "boxes": boxes, "front_to_back": front_to_back}
         return self._strips(view, first_bad, 0, self.tiles_y)
@@ -203,14 +209,14 @@ def rasterize_backward(
     gradients: Gradients,
     stored: bool = False,
 ) -> None:
-    """As `rasterizer.cpu.rasterize_backward`, on the tensors' device; with `stored`, all rows are written."""
+    """As `rasterizer.cpu.rasterize_backward`, on the tensors' device."""
     frames: Frames = forward.frames
     call, count = _Call(inputs, settings), len(frames.views)
     outputs = {name: getattr(gradients, name) for name in Gradients.NAMES}
-    if stored:
-        for gradient in outputs.values():
-            if gradient is not None:
-                gradient.zero_()
+    fresh = stored and len(frames.views[0]) == 1  # a Gaussian has all its records in the one strip
+    for name, gradient in outputs.items():
+        if gradient is not None and stored and (not fresh or name == "viewmats"):
+            gradient.zero_()
     features, viewmats = outputs.pop("features"), outputs.pop("viewmats")
     by_camera = {name: outputs.pop(name) for name in ("mean2d", "absgrad")}
     cameras = None if viewmats is None else call.means.new_zeros((count, call.n, 12))
@@ -228,6 +234,9 @@ def rasterize_backward(
                 features=None if features is None else features[:, begin:],
                 camera=None if cameras is None else cameras[camera],
                 **{name: None if of is None else of[camera] for name, of in by_camera.items()},
+                stored=stored,
+                fresh=fresh and begin == 0,
+                fresh_features=fresh,
             )
             width = _MOMENTS + min(call.dims - begin, MAX_FEATURES)
             for strip in strips:
@@ -239,10 +248,6 @@ def rasterize_backward(
         total = cameras.sum(1, dtype=torch.float64).to(cameras.dtype)
         viewmats[:, :3, :3] += total[:, :9].reshape(-1, 3, 3)
         viewmats[:, :3, 3] += total[:, 9:]
-    if stored and gradients.scales is not None:  # with respect to logarithms
-        gradients.scales.mul_(inputs.scales)
-    if stored and gradients.opacities is not None:  # with respect to logits
-        gradients.opacities.mul_(inputs.opacities * (1 - inputs.opacities))
 
 
 def label_images(inputs: Inputs, labels: np.ndarray, least: float, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
@@ -253,7 +258,9 @@ def label_images(inputs: Inputs, labels: np.ndarray, least: float, settings: Set
     visible = plain.visible[0].cpu().numpy().view(bool)
     images = []
     for row in labels:
-        names = torch.from_numpy(np.unique(row[visible & (row >= 0)])).to(viewmats.device)
+        names = torch.from_numpy(np.unique(row[visible & (row >= 0)]))
+        # Whole slices: the kernels are compiled for each width of one, in seconds.
+        names = torch.nn.functional.pad(names, (0, -len(names) % MAX_FEATURES), value=_NO_LABEL).to(viewmats.device)
         label_of = torch.from_numpy(np.ascontiguousarray(row)).to(viewmats.device)
         best = viewmats.new_full((settings.height, settings.width), least)
         image = torch.full_like(best, -1, dtype=torch.int32)

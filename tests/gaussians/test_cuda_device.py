@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from perception import _core
+from perception.gaussians.losses import assign_labels, instance_loss
 from perception.rasterizer import cpu
 from perception.rasterizer import device as on_device
 from perception.rasterizer.cuda import training
@@ -80,3 +81,14 @@ def test_adam_in_float32_follows_float64(width):
     for a, b, true in zip(found, single, exact, strict=True):
         error, cpu_error = (float((t.double().cpu() - true).norm()) for t in (a, b))
         assert error <= 3 * cpu_error + 1e-7 * float(true.norm())
+
+
+def test_the_instance_loss_in_float32_follows_float64():
+    features, image = 5 + 0.3 * random(240, 320, 11), (20 * random(240, 320, seed=3)).int()
+    assigned = assign_labels(image)
+    exact = instance_loss(features, assigned, margin=1.0, w_pos=0.3, w_neg=0.7)
+    there = assigned.to(torch.device("cuda"))
+    first, again = (instance_loss(features.float().cuda(), there, margin=1.0, w_pos=0.3, w_neg=0.7) for _ in range(2))
+    assert float(first.value) == pytest.approx(exact.value, rel=1e-5)
+    assert float((first.gradient.cpu() - exact.gradient).norm()) <= 1e-4 * float(exact.gradient.norm())
+    assert torch.equal(first.gradient, again.gradient) and torch.equal(first.prototypes, again.prototypes)

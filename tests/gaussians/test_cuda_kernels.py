@@ -159,6 +159,8 @@ def test_structs_are_those_of_the_kernels():
         on_device.GRADIENTS,
         training.ADAM_ROWS[torch.float64],
         training.PHOTOS[torch.float64],
+        training.MASKS,
+        training.PAIRS,
     )
     for i, structure in enumerate((*ours, *more)):
         assert library.emulator_struct_size(i) == ctypes.sizeof(structure)

@@ -21,6 +21,10 @@ def test_a_missing_barrier_is_noticed_in_the_order_of_the_lanes(edit):
         emulate(mutant_scene(), edit=edit)
 
 
+def empty(*shape):
+    return torch.empty(*shape, dtype=torch.float64)
+
+
 @pytest.mark.parametrize(
     "edit", [pytest.param(e, marks=[pytest.mark.slow] * (i > 0)) for i, e in enumerate(TRAINING_BARRIERS)]
 )
@@ -29,6 +33,8 @@ def test_a_missing_barrier_of_training_is_noticed(edit, monkeypatch):
     image = torch.rand(20, 30, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     with pytest.raises(RuntimeError, match=r"without a barrier between|that no thread of the block wrote"):
         training.photometric(image, image.flip(0).contiguous(), None, torch.empty_like(image), 0.2)
+        features, slots = image.view(-1, 18), torch.zeros(100, dtype=torch.int32)
+        training.prototypes(features, slots, torch.tensor([100]), torch.tensor([0]), empty(1, 18), empty(1))
 
 
 @pytest.mark.slow

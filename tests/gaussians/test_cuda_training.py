@@ -57,9 +57,10 @@ def test_photometric_loss_and_gradient(beta, weights, size):
         torch.testing.assert_close(gradients[1], gradients[0], **CLOSE)
 
 
-@pytest.mark.parametrize("labels", [0, 1, 7])
-def test_instance_loss_and_gradient(labels, monkeypatch):
-    features = 5 + 0.3 * random(31, 70, 4)  # more than one piece of pixels, and far from 0
+@pytest.mark.usefixtures("kernels_of_the_emulator")
+@pytest.mark.parametrize(("labels", "dims"), [(0, 4), (1, 4), (7, 4), (40, 11)])
+def test_instance_loss_and_gradient(labels, dims, monkeypatch):
+    features = 5 + 0.3 * random(31, 70, dims)  # far from 0
     image = (random(31, 70, seed=3) * (labels + 1)).int()
     assigned = assign_labels(image)
     expected = instance_loss(features, assigned, margin=1.0, w_pos=0.3, w_neg=0.7)

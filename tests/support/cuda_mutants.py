@@ -29,6 +29,7 @@ TRAINING_BARRIERS = [
     ("half /= 2) {\n    __syncthreads();", "half /= 2) {"),
     ("photo.slopes[j * plane + at];\n    }\n    __syncthreads();", "photo.slopes[j * plane + at];\n    }"),
     ("rows[j][i] = sum;\n      }\n    __syncthreads();", "rows[j][i] = sum;\n      }"),
+    ("    __syncthreads();  // the sums have been read\n", ""),
 ]
 SLIPS = [
     ("strip.ends[rank - 1] : 0, tiles, ids", "strip.ends[rank] : 0, tiles, ids"),
@@ -50,8 +51,8 @@ SLIPS = [
     ("first + lane, last, kWarp, part", "first + lane + 1, last, kWarp, part"),
     ("if (lane == owner) sum[c] = part[c];", "if (lane == 0) sum[c] = part[c];"),
     ("s.rgb[c] > 0 ? g_rgb[c]", "s.rgb[c] > 1 ? g_rgb[c]"),
-    ("out.features[i * scene.dims + c] +=", "out.features[rank * scene.dims + c] +="),
-    ("add(out.camera, i, g_camera, 12)", "add(out.camera, rank, g_mean, 3)"),
+    ("const Index at = i * scene.dims + c;", "const Index at = rank * scene.dims + c;"),
+    ("add(out.camera, i, g_camera, 12, fresh)", "add(out.camera, rank, g_mean, 3, fresh)"),
 ]  # fmt: skip
 
 

@@ -8,7 +8,7 @@ import functools
 import hashlib
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,7 +24,7 @@ Stream = Callable[[], AbstractContextManager[int]]
 THREADS = 256  # of a block, as in kernels.cu
 _TOO_NEW = (209, 218, 222)  # no kernel image, invalid PTX, unsupported PTX: the driver is older than the compiler
 _FILES = {
-    "cuda": ("kernels.cu", "device.h", "prepare.h", "forward.h", "backward.h", "reduce.h", "training.h"),
+    "cuda": ("kernels.cu", "device.h", "prepare.h", "forward.h", "backward.h", "reduce.h", "training.h", "instances.h"),
     "rasterizer": ("constants.h", "projection_math.h", "spherical_harmonics.h"),
 }
 _CMATH = "#pragma once\nnamespace std { using ::sqrt; using ::fabs; }\n"  # NVRTC has the functions, but no headers
@@ -185,8 +185,13 @@ def _device_kernels(options: KernelOptions, index: int) -> Kernels:
         raise InputError(f"{name} has compute capability {major}.{minor}, expected 7.5 or more; compute on the CPU")
 
     @contextmanager
-    def stream() -> Iterator[int]:
+    def switched() -> Iterator[int]:
         with torch.cuda.device(index):
             yield torch.cuda.current_stream().cuda_stream
+
+    def stream() -> AbstractContextManager[int]:
+        if torch.cuda.current_device() != index:
+            return switched()
+        return nullcontext(torch.cuda.current_stream().cuda_stream)  # a switch takes longer than a launch
 
     return Kernels(load_driver(), cached_kernels(options, 10 * major + minor), stream)

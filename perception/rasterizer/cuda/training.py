@@ -1,11 +1,15 @@
 """The training kernels of `perception._core.training` for tensors on a device: the same arguments.
 
-Adam and the photometric loss are kernels of csrc/cuda/training.h; the rest is made of torch's operations. Results are
-those of the compiled kernels up to rounding. Figures come back as tensors of one element, so that no call waits for the
-device. No floating-point sum is made by atomic additions, so equal input gives equal bits on one device.
+Adam, the photometric and the instance loss are kernels of csrc/cuda; the rest is made of torch's operations. Results
+are those of the compiled kernels up to rounding. Figures come back as tensors of one element, so that no call waits for
+the device. No floating-point sum is made by atomic additions, so equal input gives equal bits on one device.
 """
 
 from __future__ import annotations
+
+import ctypes
+import functools
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +22,7 @@ _TAPS = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
 _WINDOW = {f"tap{i}": tap for i, tap in enumerate(_TAPS / _TAPS.sum())}
 """Of SSIM (Wang et al. 2004): 11 pixels, σ = 1.5."""
 ADAM_ROWS = device.structures(
-    "AdamRows", "param first second grad rates visible skipped", "rows width", "rate beta1 beta2 eps root"
+    "AdamRows", "param first second grad shares visible skipped", "rows width", "rate beta1 beta2 eps root"
 )
 PHOTOS = device.structures(
     "Photo",
@@ -26,8 +30,12 @@ PHOTOS = device.structures(
     "width height channels tiles_x",
     "beta " + " ".join(_WINDOW),
 )
-_PIECE = 1024
-"""Pixels whose features are summed in float32; these sums are added in float64."""
+MASKS = device.structure(
+    "Masks", "features slots counts first parts means scatter pull push spread", "pixels masks dims"
+)
+PAIRS = device.structure("Pairs", "points gradient value", "count dims", "margin", ctypes.c_double)
+_PIECES = 32
+"""As kPieces of instances.h."""
 
 
 def _kernels(of: Tensor) -> Kernels:
@@ -71,43 +79,35 @@ def photometric(
 
 def prototypes(features: Tensor, slots: Tensor, counts: Tensor, first: Tensor, means: Tensor, scatter: Tensor) -> None:
     """Mean feature per slot [M, D] and sum of squared distances to it [M]; features [P, D], slots [P], −1 = none."""
-    if len(counts) == 0:
-        return
-    # Sums are taken about a pixel of the label itself, so that features far from zero do not cancel.
-    reference = features[first]
-    offset = features - reference[slots.long().clamp(min=0)]
-    values = torch.cat([offset, offset.square()], dim=1)
-    missing = -len(slots) % _PIECE
-    values = torch.nn.functional.pad(values, (0, 0, 0, missing)).view(-1, _PIECE, values.shape[1])
-    padded = torch.nn.functional.pad(slots, (0, missing), value=-1).view(-1, 1, _PIECE)
-    members = padded == torch.arange(len(counts), device=slots.device)[:, None]  # [pieces, M, _PIECE]
-    sums, squares = torch.bmm(members.to(values.dtype), values).double().sum(dim=0).chunk(2, dim=1)
-    mean = sums / counts[:, None]
-    means.copy_(reference.double() + mean)
-    scatter.copy_((squares - sums * mean).clamp(min=0).sum(dim=1))
+    masks, dims = means.shape
+    values = {"counts": counts, "first": first, "parts": means.new_empty((masks, _PIECES, dims, 2))}
+    of = _masks(features, slots, means, scatter=scatter, **values)
+    _kernels(features).launch("prototype_parts_kernel", masks * _PIECES, of)
+    _kernels(features).launch("prototype_kernel", (masks + THREADS - 1) // THREADS, of)
+
+
+def _masks(features: Tensor, slots: Tensor, means: Tensor, **more: Tensor) -> Any:
+    sizes = {"pixels": len(slots), "masks": len(means), "dims": features.shape[1]}
+    return device.filled(MASKS, features=features, slots=slots, means=means, **more, **sizes)
 
 
 def separation(points: Tensor, margin: float, gradient: Tensor) -> Tensor:
     """Mean relu(margin - squared distance) over the pairs of points [M, D] float64, and its gradient."""
-    gradient.zero_()
-    count = len(points)
+    count, dims = points.shape
     if count < 2:
+        gradient.zero_()
         return points.new_zeros(())
-    difference = points[:, None] - points[None]
-    near = margin - difference.square().sum(dim=2)
-    pairs, active = 0.5 * count * (count - 1), (near > 0).to(points.dtype).fill_diagonal_(0)
-    gradient.add_((difference * active[..., None]).sum(dim=1), alpha=-2 / pairs)
-    return 0.5 * (near * active).sum() / pairs
+    value = points.new_empty(())
+    pairs = device.filled(PAIRS, points=points, gradient=gradient, value=value, count=count, dims=dims, margin=margin)
+    single = KernelOptions(0, False, False)  # the points are float64 beside any features
+    device.device_kernels(single, points.device).launch("separation_kernel", 1, pairs)
+    return value
 
 
 def spread(features: Tensor, slots: Tensor, means: Tensor, pull: Tensor, push: Tensor, out: Tensor) -> None:
     """out = pull[slot] (F - means[slot]) + push[slot], 0 without a slot."""
-    if len(means) == 0:
-        out.zero_()
-        return
-    index = slots.long().clamp(min=0)
-    pull, push, means = (table.to(features.dtype)[index] for table in (pull, push, means))
-    out.copy_(torch.where(slots[:, None] >= 0, pull[:, None] * (features - means) + push, 0.0))
+    of = _masks(features, slots, means, pull=pull, push=push, spread=out)
+    _kernels(features).launch("spread_kernel", (features.numel() + THREADS - 1) // THREADS, of)
 
 
 def sum(values: Tensor, squared: bool) -> Tensor:
@@ -123,24 +123,26 @@ def scale(values: Tensor, factor: float, out: Tensor) -> None:
 
 def adam(
     param: Tensor, grad: Tensor, first: Tensor, second: Tensor, visible: Tensor | None, rate: np.ndarray,
-    step: int, beta1: float, beta2: float, eps: float,
+    step: int, beta1: float, beta2: float, eps: float, skipped: Tensor | None = None,
 ) -> Tensor:  # fmt: skip
-    """One Adam step in place on the visible rows of [N, W]; the number of rows skipped for a non-finite gradient."""
-    rate = rate / (1 - beta1**step)
-    rates = None if (rate == rate[0]).all() else torch.from_numpy(rate).to(param)
-    skipped = torch.zeros((), dtype=torch.int32, device=param.device)
+    """One Adam step in place on the visible rows of [N, W]; the number of rows skipped for a non-finite gradient, added
+    to `skipped` where one is given."""
+    alike = bool((rate == rate[0]).all())
+    shares = None if alike else _on_device((rate / rate.max()).tobytes(), param.dtype, param.device)
+    if skipped is None:
+        skipped = torch.zeros((), dtype=torch.int32, device=param.device)
     rows = device.filled(
         ADAM_ROWS[param.dtype],
         param=param,
         first=first,
         second=second,
         grad=grad,
-        rates=rates,
+        shares=shares,
         visible=visible,
         skipped=skipped,
         rows=param.shape[0],
         width=param.shape[1],
-        rate=rate[0],
+        rate=rate.max() / (1 - beta1**step),
         beta1=beta1,
         beta2=beta2,
         eps=eps,
@@ -150,8 +152,14 @@ def adam(
     return skipped
 
 
+@functools.lru_cache(maxsize=16)
+def _on_device(numbers: bytes, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """float64 `numbers` as a tensor; the harmonics' rates keep their shares of the largest through a training."""
+    return torch.from_numpy(np.frombuffer(numbers).copy()).to(device, dtype)
+
+
 def add_statistics(mean2d: Tensor, visible: Tensor, gradient: Tensor, seen: Tensor, scale: float) -> None:
     """Adds one view, where visible: scale |mean2d| to gradient, 1 to seen."""
-    here = visible > 0
-    gradient.add_(torch.where(here, scale * mean2d.norm(dim=1), 0.0))
-    seen.add_(here.to(seen.dtype))
+    size = mean2d.norm(dim=1)
+    gradient.add_(size.masked_fill_(visible == 0, 0), alpha=scale)
+    seen.add_(visible)
