@@ -178,6 +178,6 @@ void bind_graph(nb::module_ &m) {
         nb::arg("one_sided"), nb::arg("prior"), nb::arg("lowest"), nb::arg("many"), nb::arg("sure"),
         nb::arg("children").noconvert(),
         nb::arg("affinity").noconvert(),
-        "Merge tree of segments by their masks; see perception.instances.consensus. Fills children and affinity and "
+        "Merge tree of segments by their masks; see perception.masks.consensus. Fills children and affinity and "
         "returns the number of merges.");
 }

@@ -1,4 +1,4 @@
-// Segments merged as the masks of all photos agree; the formulas stand in perception/instances/consensus.py.
+// Segments merged as the masks of all photos agree; the formulas stand in perception/masks/consensus.py.
 #pragma once
 #include <cstddef>
 #include <cstdint>

@@ -9,7 +9,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from perception.geometry import nearest
-from perception.instances.votes import MaskVotes
+from perception.masks.votes import MaskVotes
 
 CHUNK, ENTRIES = 20_000, 10_000_000  # Gaussians, and their affinities with instances or 4 × weights, at once
 NEIGHBOURS = 8  # nearest voters of a Gaussian

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from perception.instances.consensus import Evidence
+from perception.masks.consensus import Evidence
 
 CALIBRATION = (
     (0.0, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0),

@@ -1,7 +1,8 @@
 """Instances, their parts and their scores from Gaussians and mask votes.
 
 segments    many small groups of Gaussians with similar feature and position       `segments`
-consensus   segments merged and cut into instances and parts, by the masks         `consensus`
+consensus   segments merged and cut into instances and parts, by the masks         `masks.consensus`
+            (not where labels are of one surface: a Gaussian has the label that most pixels give it)
 settle      Gaussians move to the instance that masks and neighbours agree on      `assign`
 score       the probability that an instance is an object                          `confidence`
 """
@@ -17,10 +18,10 @@ from perception.geometry import sums_by
 from perception.instances.assign import LEAST_AGREEMENT, memberships, reassign, without_strays
 from perception.instances.cluster import MIN_OPACITY, by_falling_size, cluster_gaussians
 from perception.instances.confidence import calibrated, raw_scores
-from perception.instances.consensus import best_cut, dendrogram, evidence, node_evidence, parts_of
 from perception.instances.segments import over_segment, touching
-from perception.instances.votes import MaskVotes
 from perception.machine import return_free_memory
+from perception.masks.consensus import best_cut, dendrogram, evidence, node_evidence, parts_of
+from perception.masks.votes import MaskVotes
 
 PER_SEGMENT = 16  # Gaussians; smaller segments have too little evidence in the photos
 LEAST_SEGMENTS, MAX_SEGMENTS = 32, 1000
@@ -67,15 +68,20 @@ def group(
     margin: float = 1.0,
     seed: int = 0,
     whole: bool = True,
+    one_surface: bool = False,
 ) -> Grouping:
     """Instances of N Gaussians: means [N, 3], scales [N, 3], opacities [N], features [N, D] float32.
 
     margin: γ of the loss, the squared distance that it keeps between features of different objects. whole: they are all
-    of the map's; else masks may be those of others, and what they show is no reason to keep a small group.
+    of the map's; else masks may be those of others, and what they show is no reason to keep a small group. one_surface:
+    equal labels of two photos are of one thing, so there is nothing to find out from features and agreement.
     """
     features = np.where(np.isfinite(features), features, 0) / np.sqrt(margin)
     if config.method == "hdbscan":
         ids = cluster_gaussians(means, scales, opacities, features, config, seed)
+        parts, parents = np.full(len(ids), -1), np.zeros(0, np.int64)
+    elif one_surface:
+        ids = _by_labels(means, opacities, votes)
         parts, parents = np.full(len(ids), -1), np.zeros(0, np.int64)
     else:
         ids, parts, parents = _by_consensus(means, opacities, features, votes, seed)
@@ -86,6 +92,16 @@ def group(
         ids = without_strays(ids, means, opacities, MIN_OPACITY)
     return_free_memory()
     return scored(ids, parts, parents, votes)
+
+
+def _by_labels(means: np.ndarray, opacities: np.ndarray, votes: MaskVotes) -> np.ndarray:
+    """ids [N] int32: of each Gaussian the label in which it has most weight, −1 = in none."""
+    weights = votes.of_labels()
+    ids = np.full(len(means), -1, np.int32)
+    shown = np.diff(weights.indptr) > 0
+    ids[shown] = np.asarray(weights[shown].argmax(axis=1)).reshape(-1)
+    ids[(opacities < MIN_OPACITY) | ~np.isfinite(means).all(axis=1)] = -1
+    return ids
 
 
 def _by_consensus(

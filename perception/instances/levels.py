@@ -9,10 +9,10 @@ import numpy as np
 from perception.geometry import nearest
 from perception.instances.assign import reassign
 from perception.instances.cluster import MIN_OPACITY
-from perception.instances.consensus import LARGEST_PART
 from perception.instances.group import Grouping, scored, scored_parts
-from perception.instances.votes import MaskVotes
+from perception.masks.consensus import LARGEST_PART
 from perception.masks.merging import Segmentation
+from perception.masks.votes import MaskVotes
 
 LEAST_PART = 32  # Gaussians; smaller parts are not kept
 ODDS = 2.5  # fitted to the 71 instances of maps of two made worlds

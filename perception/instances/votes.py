@@ -8,7 +8,6 @@ the mask. One backward pass computes BLOCK masks for all Gaussians.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -18,6 +17,7 @@ from perception.gaussians.model import Nearby
 from perception.gaussians.views import TrainingView
 from perception.io.memory import Keep
 from perception.machine import return_free_memory, torch_on_one_thread
+from perception.masks.votes import MaskVotes
 from perception.progress import Progress
 from perception.rasterizer.rasterize import rasterizer_for
 from perception.rasterizer.types import Cotangents, Gradients, Settings
@@ -26,52 +26,6 @@ BLOCK = 16  # masks per pass: a feature width that the kernel is specialised for
 TRIM = 16  # views between which freed memory is returned: the kept votes split what one view's arrays filled
 FEW = 0.25  # share of the Gaussians; a view of fewer is rendered of these alone
 FAINTEST = 0.02  # pixels; smaller weights are dropped to keep the matrix sparse
-
-
-@dataclass(frozen=True)
-class MaskVotes:
-    """Weights of N Gaussians, or of groups of them, in the M masks of V views: the pixels that they fill; sparse.
-
-    pixels [N, M] float32: in each mask. void [N, V] float32: in each view, where it has no mask. view [M] int64: of
-    each mask, 0 … V − 1 ascending. area [M] float64: pixels of each mask.
-    """
-
-    pixels: sparse.csr_matrix
-    void: sparse.csr_matrix
-    view: np.ndarray
-    area: np.ndarray
-
-    def of_groups(self, ids: np.ndarray, count: int) -> MaskVotes:
-        """Votes of the groups 0 … count − 1, sums over their members; ids [N]: the group of each row, −1 = none."""
-        rows = np.flatnonzero(ids >= 0)
-        ones = np.ones(len(rows), np.float32)
-        return self._summed(sparse.csr_matrix((ones, (ids[rows], rows)), shape=(count, len(ids))))
-
-    def pooled(self, groups: Sequence[np.ndarray]) -> MaskVotes:
-        """Votes of groups that may share rows; groups: the rows of each."""
-        ends = np.cumsum([0, *map(len, groups)])
-        members = (np.ones(ends[-1], np.float32), np.concatenate(groups), ends)
-        return self._summed(sparse.csr_matrix(members, shape=(len(groups), self.pixels.shape[0])))
-
-    def _summed(self, members: sparse.csr_matrix) -> MaskVotes:
-        """members [R, N]: 1 for the rows of each of R groups. The columns of each row of the result ascend."""
-        tables = members @ self.pixels, members @ self.void
-        for table in tables:
-            table.sort_indices()
-        return MaskVotes(*tables, self.view, self.area)
-
-    def runs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """(row, view) [L] of each row and view with masks of it, the first of its entries in `pixels.data` [L], and
-        the pixels under its masks [L] float64."""
-        row = np.repeat(np.arange(self.pixels.shape[0]), np.diff(self.pixels.indptr))
-        view = self.view[self.pixels.indices]
-        first = np.flatnonzero((np.diff(row, prepend=-1) != 0) | (np.diff(view, prepend=-1) != 0))
-        sums = np.add.reduceat(self.pixels.data.astype(np.float64), first) if len(first) else np.zeros(0)
-        return row[first], view[first], first, sums
-
-    def per_entry(self, first: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """`values` [L] of `runs` repeated for each entry of `pixels.data`."""
-        return np.repeat(values, np.diff(first, append=self.pixels.nnz))
 
 
 @torch_on_one_thread()
@@ -92,13 +46,15 @@ def mask_votes(
     voids: list[sparse.csc_matrix] = []
     owner: list[np.ndarray] = []
     areas: list[np.ndarray] = []
+    labels: list[np.ndarray] = []
     for index, view in enumerate(views):
         shown = view.halved() if half_resolution and min(view.photo.shape[:2]) > 1 else view
         if shown.labels is not None and bool((shown.labels > 0).any()):
-            weights, area = _of_view(nearby, shown)
+            weights, area, names = _of_view(nearby, shown)
             parts.append(_kept(weights[:, 1:], keep))
             voids.append(_kept(weights[:, :1], keep))
             areas.append(area[1:])
+            labels.append(names[1:].astype(np.int64))
             owner.append(np.full(len(area) - 1, len(owner), np.int64))
         if index % TRIM == TRIM - 1:
             return_free_memory()
@@ -107,7 +63,8 @@ def mask_votes(
     if not parts:
         none = sparse.csr_matrix((len(nearby.gaussians), 0), dtype=np.float32)
         return MaskVotes(none, none, np.zeros(0, np.int64), np.zeros(0))
-    return MaskVotes(beside(parts, keep), beside(voids, keep), np.concatenate(owner), np.concatenate(areas))
+    columns = (np.concatenate(each) for each in (owner, areas, labels))
+    return MaskVotes(beside(parts, keep), beside(voids, keep), *columns)
 
 
 def _kept(part: sparse.csc_matrix, keep: Keep) -> sparse.csc_matrix:
@@ -141,8 +98,8 @@ def beside(parts: list[sparse.csc_matrix], keep: Keep = np.asarray) -> sparse.cs
 
 
 @torch.no_grad()
-def _of_view(nearby: Nearby, view: TrainingView) -> tuple[sparse.csc_matrix, np.ndarray]:
-    """Weights [N, 1 + masks] and areas of one view. Column 0 holds the pixels that no mask covers."""
+def _of_view(nearby: Nearby, view: TrainingView) -> tuple[sparse.csc_matrix, np.ndarray, np.ndarray]:
+    """Weights [N, 1 + masks], areas and labels of one view. Column 0 holds the pixels that no mask covers."""
     assert view.labels is not None  # checked by the caller
     height, width = view.photo.shape[:2]
     names, dense = np.unique(np.append(view.labels.numpy(), 0), return_inverse=True)
@@ -173,4 +130,4 @@ def _of_view(nearby: Nearby, view: TrainingView) -> tuple[sparse.csc_matrix, np.
         blocks.append((weights[row, column], rows[seen[row]], column + first))
     weights, row, column = map(np.concatenate, zip(*blocks, strict=True))
     table = sparse.csc_matrix((weights, (row, column)), shape=(len(nearby.gaussians), len(names)))
-    return table, np.bincount(dense.reshape(-1)[:-1], minlength=len(names)).astype(float)
+    return table, np.bincount(dense.reshape(-1)[:-1], minlength=len(names)).astype(float), names

@@ -5,6 +5,7 @@ Label ids are consistent across photos, because every photo shows the same segme
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.geometry import move_points
 from perception.io.memory import Keep
+from perception.masks.averaging import averaged
 from perception.masks.base import LoadImage, MaskSource
 from perception.masks.boundaries import WEIGHTS, boundaries, read_layers
 from perception.masks.cues import filled, photo_cues
@@ -22,9 +24,10 @@ from perception.masks.surface_graph import SurfaceGraph, patches, voxel_edges
 from perception.progress import QUIET, Progress
 from perception.types import View
 
-VERSION = 15  # increased whenever the label images change, so that cached ones are recomputed
+VERSION = 16  # increased whenever the label images change, so that cached ones are recomputed
 _SMOOTH = 0.03  # relative to the depth: a pixel with a larger depth step is not part of the surface
 _LEAST_VOXELS = 100
+SHIFTS = (0.0, 1 / 3, 2 / 3)  # of the voxels' grid, in their sides: the segmentations that are averaged
 _BAND = 2  # pixels to either side of where segments meet, between which their border may move; half a voxel
 _LEARNED = 15.0  # of a certain learned border, in the unit of the photo's gradient (Lab)
 
@@ -59,10 +62,12 @@ class BuiltinSegmentation(MaskSource):
         if len(stereo) < 2:
             return None
         measure_depths(stereo, progress)
-        surface = fuse(stereo)
-        if len(surface) < _LEAST_VOXELS:
+        surfaces = fuse(stereo, shifts=SHIFTS)
+        if min(map(len, surfaces)) < _LEAST_VOXELS:
             return None
-        cuts = segmentation(surface_graph(stereo, surface))
+        cuts, *others = map(segmentation, surface_graphs(stereo, surfaces))
+        pairs = zip(surfaces[1:], others, strict=True)
+        cuts = averaged(cuts, [(on_points(surface, of, cuts.points), of.probability) for surface, of in pairs])
         self._labels = {view.name: keep(labels_of(view, cuts.segment)) for view in stereo}
         return cuts
 
@@ -98,29 +103,47 @@ def labels_of(view: StereoView, segment: np.ndarray) -> np.ndarray:
     return np.asarray(watershed(gradient, seeds), np.int32)
 
 
-def fuse(views: list[StereoView], side: float = FOOTPRINTS, weights: Path = WEIGHTS) -> Surface:
-    """Fuses the confirmed pixels of all photos into one surface. side: of a voxel, in pixel footprints; weights: of
-    learned borders."""
+def on_points(surface: Surface, cuts: Segmentation, points: np.ndarray) -> np.ndarray:
+    """[P] int32 segment of points [P, 3] in the cuts of a surface, 0 = none."""
+    voxel = surface.voxel_of(points.astype(np.float64))
+    return np.where(voxel >= 0, cuts.segment[voxel], 0)
+
+
+def fuse(
+    views: list[StereoView], side: float = FOOTPRINTS, weights: Path = WEIGHTS, shifts: Sequence[float] = (0.0,)
+) -> list[Surface]:
+    """Fuses the confirmed pixels of all photos into one surface, once for each grid of voxels.
+
+    side: of a voxel, in pixel footprints; weights: of learned borders; shifts: of the grids along each axis, in sides.
+    """
     layers = read_layers(weights)
     footprints = np.concatenate([(view.depth[::4, ::4] / view.K[0, 0]).ravel() for view in views])
-    builder = SurfaceBuilder(side * float(np.median(footprints)))
+    builders = [SurfaceBuilder(side * float(np.median(footprints)), shift) for shift in shifts]
     for view in views:
         photo, depth = view.cues()
         view.learned = view.keep(boundaries(photo, depth, layers).astype(np.float16))
         border = 1 / (1 + np.exp(-view.learned[:2].max(axis=0).astype(np.float32)))
         known = view.confirmed & (depth.step.max(axis=0) < _SMOOTH)
-        builder.add(photo, depth, border, known, view.world_from_camera)
-    return builder.build()
+        for builder in builders:
+            builder.add(photo, depth, border, known, view.world_from_camera)
+    return [builder.build() for builder in builders]
 
 
-def surface_graph(views: list[StereoView], surface: Surface) -> SurfaceGraph:
-    """Patches of the surface, with the evidence of all photos, which were fused, about the borders between them."""
-    edges = voxel_edges(surface)
-    graph = SurfaceGraph(surface, patches(surface, edges), edges)
+def surface_graphs(views: list[StereoView], surfaces: Sequence[Surface]) -> list[SurfaceGraph]:
+    """Patches of each surface, with the evidence of all photos, which were fused, about the borders between them. The
+    views are given the voxels of the first."""
+    graphs = []
+    for surface in surfaces:
+        edges = voxel_edges(surface)
+        graphs.append(SurfaceGraph(surface, patches(surface, edges), edges))
     for view in views:
         photo, depth = view.cues()
-        view.voxel = view.keep(surface.voxel_of(move_points(view.world_from_camera, depth.points.astype(np.float64))))
-        regions = np.where(view.voxel >= 0, graph.patch[view.voxel], -1)
-        graph.add(regions, photo, depth, np.asarray(view.learned, np.float32))
-    graph.link()
-    return graph
+        points, learned = move_points(view.world_from_camera, depth.points.astype(np.float64)), view.learned
+        voxels = [surface.voxel_of(points) for surface in surfaces]
+        for graph, voxel in zip(graphs, voxels, strict=True):
+            regions = np.where(voxel >= 0, graph.patch[voxel], -1)
+            graph.add(regions, photo, depth, np.asarray(learned, np.float32))
+        view.voxel = view.keep(voxels[0])
+    for graph in graphs:
+        graph.link()
+    return graphs

@@ -37,7 +37,7 @@ class StereoView:
     prior: [h, w] depth known before stereo, 0 = none. preferred: the prior where stereo prefers it, 0 = nowhere near.
     depth: [h, w] current best depth. confirmed: [h, w] bool, pixels whose depth other photos agree with. measured: the
     prior comes from a sensor. learned: [3, h, w] float16, see `boundaries`, set by `fuse`. voxel: [h, w] int32, the
-    voxel of the surface that each pixel shows, −1 = none, set by `surface_graph`. keep: where images that are made
+    voxel of the surface that each pixel shows, −1 = none, set by `surface_graphs`. keep: where images that are made
     later are kept.
     """
 

@@ -18,11 +18,15 @@ _OFFSET = 1 << 20  # makes voxel indices positive; 2^21 values per axis
 
 @dataclass(frozen=True)
 class Surface:
-    """V voxels of side `size`. keys [V] int64 ascending; pixels [V]: number of pixels in each, over all photos;
-    points, normals, lab [V, 3] float32 means in the world frame (Lab in 8-bit scale); border [V]: mean probability that
-    pixels to both sides are of different things."""
+    """V voxels of side `size`, a corner of one at `origin` along each axis.
+
+    keys [V] int64 ascending; pixels [V]: number of pixels in each, over all photos; points, normals, lab [V, 3] float32
+    means in the world frame (Lab in 8-bit scale); border [V]: mean probability that pixels to both sides are of
+    different things.
+    """
 
     size: float
+    origin: float
     keys: np.ndarray
     pixels: np.ndarray
     points: np.ndarray
@@ -35,18 +39,19 @@ class Surface:
 
     def voxel_of(self, points: np.ndarray) -> np.ndarray:
         """[...] int32 index of the voxel that contains each of points [..., 3]; −1 where there is none."""
-        voxel = position_in(self.keys, voxel_keys(points.reshape(-1, 3), self.size))
+        voxel = position_in(self.keys, voxel_keys(points.reshape(-1, 3) - self.origin, self.size))
         return voxel.astype(np.int32).reshape(points.shape[:-1])
 
 
 class SurfaceBuilder:
     """Accumulates photos one by one. Memory grows with the surface, not with the number of photos.
 
-    size: side of the voxels. Each voxel has sums over its pixels, columns _COUNT to _BORDER.
+    size: side of the voxels; shift: of their grid along each axis, in sides. Each voxel has sums over its pixels,
+    columns _COUNT to _BORDER.
     """
 
-    def __init__(self, size: float) -> None:
-        self.size = size
+    def __init__(self, size: float, shift: float = 0.0) -> None:
+        self.size, self.origin = size, shift * size
         self._keys, self._sums = np.zeros(0, np.int64), np.zeros((0, _BORDER + 1))
 
     def add(
@@ -57,7 +62,7 @@ class SurfaceBuilder:
         points = move_points(world_from_camera, depth.points[known].astype(np.float64))
         normals = depth.normals[known] @ world_from_camera[:3, :3].T
         columns = [np.ones((len(points), 1)), points, normals, photo.lab[known], border[known][:, None]]
-        self._merge(voxel_keys(points, self.size), np.concatenate(columns, axis=1))
+        self._merge(voxel_keys(points - self.origin, self.size), np.concatenate(columns, axis=1))
 
     def _merge(self, keys: np.ndarray, values: np.ndarray) -> None:
         """Adds values [P, C] to the sums of voxels keys [P]; too many voxels are made eight times as large."""
@@ -78,7 +83,9 @@ class SurfaceBuilder:
         normals = sums[:, _NORMAL] / np.maximum(np.linalg.norm(sums[:, _NORMAL], axis=1, keepdims=True), 1e-9)
         means = (sums / sums[:, :1]).astype(np.float32)
         points, lab, border = (np.ascontiguousarray(means[:, column]) for column in (_POINT, _LAB, _BORDER))
-        return Surface(self.size, self._keys[rows], sums[:, _COUNT], points, normals.astype(np.float32), lab, border)
+        return Surface(
+            self.size, self.origin, self._keys[rows], sums[:, _COUNT], points, normals.astype(np.float32), lab, border
+        )
 
 
 def position_in(ascending: np.ndarray, keys: np.ndarray) -> np.ndarray:

@@ -64,7 +64,8 @@ def group_gaussians(optimised: Optimised, run: Run, segments: Segmentation | Non
     tensors = (gaussians.means, gaussians.scales, gaussians.opacities, gaussians.features)
     means, scales, opacities, features = (tensor.detach().numpy() for tensor in tensors)
     margin = config.losses.margin
-    grouping = group(means, scales, opacities, features, votes, config.instances, margin=margin, seed=config.seed)
+    arrays, one_surface = (means, scales, opacities, features, votes), segments is not None
+    grouping = group(*arrays, config.instances, margin=margin, seed=config.seed, one_surface=one_surface)
     return grouping if segments is None else without_faint(grouping, means, opacities, votes, segments)
 
 

@@ -15,7 +15,7 @@ from perception.gaussians.state import USUAL_PHOTOS, TrainRecord, sized
 from perception.gaussians.train import Trainer
 from perception.instances.assign import LEAST_AGREEMENT, affinities, mask_shares
 from perception.instances.group import Grouping, group
-from perception.instances.votes import MaskVotes
+from perception.masks.votes import MaskVotes
 from perception.pipeline.checkpoint import TrainingObserver
 from perception.pipeline.optimise import Photos, Run
 from perception.visits.evidence import AGREE, LEAST_PIXELS, WEIGHTS
@@ -106,7 +106,7 @@ def joined_instances(votes: MaskVotes, ids: np.ndarray, rows: np.ndarray) -> np.
 def grouped(gaussians: Gaussians, votes: MaskVotes, rows: np.ndarray, config: MapConfig) -> Grouping:
     """Instances of the Gaussians `rows`, from their features and the masks."""
     part = gaussians.rows(torch.from_numpy(rows))
-    own = MaskVotes(votes.pixels[rows], votes.void[rows], votes.view, votes.area)
+    own = MaskVotes(votes.pixels[rows], votes.void[rows], votes.view, votes.area, votes.label)
     tensors = (part.means, part.scales, part.opacities, part.features)
     means, scales, opacities, features = (tensor.numpy() for tensor in tensors)
     arrays, margin = (means, scales, opacities, features), config.losses.margin

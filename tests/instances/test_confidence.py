@@ -8,8 +8,8 @@ from scipy import sparse
 
 pytest.importorskip("perception._core")
 from perception.instances.confidence import CALIBRATION, calibrated, raw_scores
-from perception.instances.consensus import evidence
-from perception.instances.votes import MaskVotes
+from perception.masks.consensus import evidence
+from perception.masks.votes import MaskVotes
 
 
 def table(*rows: list[float], area: list[float], view: list[int]) -> MaskVotes:

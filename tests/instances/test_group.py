@@ -17,7 +17,8 @@ from perception.gaussians.model import Gaussians, Nearby, from_points
 from perception.gaussians.views import TrainingView
 from perception.instances.assign import without_strays
 from perception.instances.group import Grouping, _without_small, group
-from perception.instances.votes import MaskVotes, beside, mask_votes
+from perception.instances.votes import beside, mask_votes
+from perception.masks.votes import MaskVotes
 from perception.rasterizer.rasterize import rasterize
 from perception.rasterizer.types import Gradients
 from support.blob_scenes import BlobScene, make_scene, orbit, random_scene, with_errors

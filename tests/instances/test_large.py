@@ -8,8 +8,9 @@ from scipy import sparse
 from sklearn.metrics import adjusted_rand_score
 
 pytest.importorskip("perception._core")
-from perception.instances import assign, consensus
-from perception.instances.votes import MaskVotes
+from perception.instances import assign
+from perception.masks import consensus
+from perception.masks.votes import MaskVotes
 from speed.grouping import building, grouped
 
 

@@ -10,8 +10,8 @@ from scipy import sparse
 
 from perception.instances.group import Grouping
 from perception.instances.levels import ODDS, with_levels, without_faint
-from perception.instances.votes import MaskVotes
 from perception.masks.merging import Segmentation
+from perception.masks.votes import MaskVotes
 
 
 def test_scores_parts_and_groups_by_the_nearest_voxels() -> None:

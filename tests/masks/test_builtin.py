@@ -14,7 +14,7 @@ import pytest
 from perception.errors import InputError
 from perception.geometry import move_points
 from perception.masks import compute_masks, load_labels, make_source
-from perception.masks.builtin import BuiltinSegmentation, fuse, labels_of, surface_graph
+from perception.masks.builtin import BuiltinSegmentation, fuse, labels_of, surface_graphs
 from perception.masks.cues import depth_cues
 from perception.masks.merge_features import PAIR_FEATURES, pair_features
 from perception.masks.merging import (
@@ -211,7 +211,7 @@ def true_views() -> list[StereoView]:
 
 
 def test_fused_surface_lies_on_the_parts():
-    surface = fuse(true_views())
+    (surface,) = fuse(true_views())
     p = surface.points.astype(float)
     outside = np.maximum(np.maximum(LOW - p, p - HIGH), 0)
     within = np.minimum(p - LOW, HIGH - p).min(axis=1)
@@ -228,9 +228,9 @@ def test_merging_patches_keeps_the_evidence_exact():
     """After merging, all sums equal those of a graph built from the merged patches; contacts, which no photo shows at
     some borders, those of the borders that are shown."""
     seen = true_views()[:3]
-    surface = fuse(seen)
+    (surface,) = fuse(seen)
     edges = voxel_edges(surface)
-    first = surface_graph(seen, surface)
+    (first,) = surface_graphs(seen, [surface])
 
     def graph_of(patch: np.ndarray) -> SurfaceGraph:
         graph = SurfaceGraph(surface, patch, edges)
@@ -267,8 +267,8 @@ def test_merging_patches_keeps_the_evidence_exact():
 def test_growth_of_a_union_against_its_voxels():
     """Features of a pair, from the voxels themselves: extents by singular values, not from sums of squares."""
     seen = true_views()[:3]
-    surface = fuse(seen)
-    graph = surface_graph(seen, surface)
+    (surface,) = fuse(seen)
+    (graph,) = surface_graphs(seen, [surface])
     compared = 0
     for a, links in enumerate(graph.borders):
         for b in links:
@@ -430,7 +430,7 @@ def test_cuts_of_rising_cost_are_nested():
 
 def test_parts_lie_in_segments_and_probabilities_belong_to_them():
     seen = true_views()[:3]
-    cuts = segmentation(surface_graph(seen, fuse(seen)))
+    cuts = segmentation(surface_graphs(seen, fuse(seen))[0])
     assert all(len(np.unique(cuts.segment[cuts.part == k])) == 1 for k in range(len(cuts.part_probability)))
     assert cuts.part.max() + 1 == len(cuts.part_probability) and cuts.group.max() + 1 == len(cuts.group_probability)
     assert len(cuts.group) == len(cuts.probability) == cuts.segment.max() + 1 and len(cuts.points) == len(cuts.segment)
@@ -441,8 +441,8 @@ def test_parts_lie_in_segments_and_probabilities_belong_to_them():
 
 def test_regions_of_the_tree_are_sums_of_their_patches():
     seen = true_views()[:3]
-    surface = fuse(seen)
-    graph = surface_graph(seen, surface)
+    (surface,) = fuse(seen)
+    (graph,) = surface_graphs(seen, [surface])
     tree = tree_by(read_model(), graph)
     sums = leaf_sums(tree, graph.sums)
     depth = sums[:, DEPTH] / np.maximum(sums[:, PIXELS], 1)
@@ -490,8 +490,8 @@ def test_networks_give_the_same_bits_for_any_batch():
 
 def test_segments_do_not_depend_on_the_order_of_patches():
     seen = true_views()
-    surface = fuse(seen)
-    first = surface_graph(seen, surface)
+    (surface,) = fuse(seen)
+    (first,) = surface_graphs(seen, [surface])
     order = np.random.default_rng(3).permutation(first.count).astype(np.int32)
     second = SurfaceGraph(surface, order[first.patch], voxel_edges(surface))
     for shown in seen:
@@ -517,8 +517,8 @@ def test_noise_on_a_bare_wall_is_no_thing():
         depth = (WALL - eye[1]) / rays[..., 1] * rng.normal(1, 0.004, x.shape)
         photo = rng.normal(128, 3, (120, 160, 3)).astype(np.uint8)
         views.append(make_stereo_view(View("", Path("x.jpg"), K, 160, 120, pose), photo, depth))
-    surface = fuse(views)
-    graph = surface_graph(views, surface)
+    (surface,) = fuse(views)
+    (graph,) = surface_graphs(views, [surface])
     labels, probability = divided(graph, tree_by(read_model(), graph), read_model())
     small = np.bincount(labels, minlength=len(probability)) < 0.5 * len(labels)
     assert (probability[small] < 0.5).all()

@@ -15,7 +15,7 @@ from sklearn.metrics import adjusted_rand_score
 
 from perception.config import InstanceConfig
 from perception.instances.group import Grouping, group
-from perception.instances.votes import MaskVotes
+from perception.masks.votes import MaskVotes
 
 SEEN = 100  # objects that a view shows
 PIXELS = 5.0  # of a Gaussian in a view, on average

@@ -136,10 +136,10 @@ def read_scene(folder: Path, stereo: bool, seed: int = 0, skip: int = -1, side: 
 
 def world_of(reading: Reading, borders: Path = BORDERS) -> World:
     """The surface graph of a reading, with the truth. The tabletop's three walls count as three. borders: weights."""
-    from perception.masks.builtin import fuse, surface_graph
+    from perception.masks.builtin import fuse, surface_graphs
 
-    surface = fuse(reading.views, reading.side, borders)
-    graph = surface_graph(reading.views, surface)
+    (surface,) = fuse(reading.views, reading.side, borders)
+    (graph,) = surface_graphs(reading.views, [surface])
     votes = np.zeros((len(surface), int(max(image.max() for image in reading.ids)) + 1), np.int32)
     for shown_by, image in zip(reading.views, reading.ids, strict=True):
         on_surface = shown_by.voxel >= 0

@@ -11,8 +11,9 @@ import pytest
 from scipy import sparse
 
 from perception import _core
-from perception.instances import consensus
-from perception.instances.consensus import (
+from perception.interrupts import handled
+from perception.masks import consensus
+from perception.masks.consensus import (
     LARGEST_PART,
     LEAST_SHARE,
     LOWEST,
@@ -25,8 +26,7 @@ from perception.instances.consensus import (
     node_evidence,
     parts_of,
 )
-from perception.instances.votes import MaskVotes
-from perception.interrupts import handled
+from perception.masks.votes import MaskVotes
 
 
 def a_table(seed: int, segments: int, views: int, filled: float = 0.5) -> MaskVotes:

@@ -1,4 +1,4 @@
-"""Segments into instances by agreement of the masks of all photos: a dendrogram, its best cut, and parts below it.
+"""Segments into objects by agreement of the masks of all photos: a dendrogram, its best cut, and parts below it.
 
     i, j    segments, or groups of them that were merged
     v       a view; m ∈ v: its masks
@@ -47,7 +47,7 @@ import numpy as np
 from scipy import sparse
 
 from perception import _core
-from perception.instances.votes import MaskVotes
+from perception.masks.votes import MaskVotes
 
 LEAST_SHARE = 0.1  # of w_ijv; a view that shows less of a segment is ignored
 ONE_SIDED = 0.5  # weight of a view that labels only one of the two, relative to a view that labels both

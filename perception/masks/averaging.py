@@ -1,0 +1,83 @@
+"""One segmentation of a surface from several, of which none is to be trusted alone.
+
+Merges are greedy: where voxels begin, by a fraction of their side, changes which patches there are, and one wrong merge
+early can join two things. Each segmentation is taken for a photo and its segments for masks (`consensus`): the segments
+of all are cut into pieces that none divides, and these are joined as most segmentations have them together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import sparse
+
+from perception.masks.consensus import best_cut, dendrogram, node_evidence
+from perception.masks.merging import Segmentation
+from perception.masks.votes import MaskVotes
+
+
+def averaged(first: Segmentation, others: Sequence[tuple[np.ndarray, np.ndarray]]) -> Segmentation:
+    """`first` with segments on which it and the others agree most.
+
+    others: segment [V] int of each voxel of `first`, numbered from 1, 0 = none, and probability [S + 1] of each. The
+    probability of the new ones: the mean, over all segmentations, of the segment's that fits best, times its IoU.
+    """
+    segments = [first.segment, *(segment for segment, _ in others)]
+    probability = [first.probability, *(probability for _, probability in others)]
+    rows, piece = np.unique(np.stack(segments, axis=1), axis=0, return_inverse=True)
+    voxels = np.bincount(piece.reshape(-1)).astype(np.float32)
+    votes = _votes(rows, voxels, [len(each) - 1 for each in probability])
+    alone = sparse.csr_matrix((len(rows), len(rows)), dtype=bool)
+    tree = dendrogram(votes, np.zeros((len(rows), 1)), np.ones(len(rows)), alone)
+    cut = best_cut(tree, node_evidence(tree, votes).matched)
+
+    owner, sizes = np.zeros(len(rows), np.int64), np.zeros(len(cut) + 1)
+    for number, node in enumerate(cut, start=1):
+        leaves = tree.leaves_of(node)
+        owner[leaves], sizes[number] = number, voxels[leaves].sum()
+    shared = votes.of_groups(owner - 1, len(cut)).pixels.toarray()
+    iou = shared / (sizes[1:, None] + votes.area - shared)
+    fitting = iou * np.concatenate([each[1:] for each in probability])
+    starts = np.flatnonzero(np.diff(votes.view, prepend=-1))
+    odds = np.append(0, np.maximum.reduceat(fitting, starts, axis=1).sum(axis=1) / len(segments))
+
+    least = np.bincount(first.segment)[1:].min(initial=len(piece))  # what one segmentation keeps
+    sizes[(sizes < least) | (np.append(0, shared.sum(axis=1)) == 0)] = 0
+    order = np.argsort(-sizes[1:], kind="stable") + 1
+    order = order[sizes[order] > 0]
+    rank = np.zeros(len(sizes), np.int32)
+    rank[order] = np.arange(1, len(order) + 1)
+    return _with_segments(first, rank[owner[piece.reshape(-1)]], np.append(0, odds[order]))
+
+
+def _votes(rows: np.ndarray, voxels: np.ndarray, counts: Sequence[int]) -> MaskVotes:
+    """Votes of pieces with `voxels` [A] each, in the segments rows [A, K] of K segmentations of `counts` segments."""
+    pieces, many = rows.shape
+    starts = np.cumsum([0, *counts])
+    piece, each = np.divmod(np.arange(rows.size), many)
+    known = rows.reshape(-1) > 0
+    column, weight = rows.reshape(-1) - 1 + starts[each], voxels[piece]
+    pixels = sparse.csr_matrix((weight[known], (piece[known], column[known])), shape=(pieces, starts[-1]))
+    void = sparse.csr_matrix((weight[~known], (piece[~known], each[~known])), shape=(pieces, many))
+    area = np.asarray(pixels.sum(axis=0), np.float64).reshape(-1)
+    return MaskVotes(pixels, void, np.repeat(np.arange(many), counts), area)
+
+
+def _with_segments(first: Segmentation, segment: np.ndarray, probability: np.ndarray) -> Segmentation:
+    """`first` with other segments: its parts where these cross them, and of its groups that of most of their voxels."""
+    width = len(first.part_probability)
+    pairs, part = np.unique(segment * np.int64(width) + first.part, return_inverse=True)
+    shared = np.zeros((len(probability), len(first.group_probability)), np.int64)
+    np.add.at(shared, (segment, first.group[first.segment]), 1)
+    groups, group = np.unique(shared.argmax(axis=1), return_inverse=True)
+    return replace(
+        first,
+        segment=segment,
+        probability=probability,
+        part=part,
+        part_probability=first.part_probability[pairs % width],
+        group=group,
+        group_probability=first.group_probability[groups],
+    )
