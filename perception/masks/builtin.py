@@ -62,12 +62,9 @@ class BuiltinSegmentation(MaskSource):
         if len(stereo) < 2:
             return None
         measure_depths(stereo, progress)
-        surfaces = fuse(stereo, shifts=SHIFTS)
-        if min(map(len, surfaces)) < _LEAST_VOXELS:
+        cuts = segmented(stereo)
+        if cuts is None:
             return None
-        cuts, *others = map(segmentation, surface_graphs(stereo, surfaces))
-        pairs = zip(surfaces[1:], others, strict=True)
-        cuts = averaged(cuts, [(on_points(surface, of, cuts.points), of.probability) for surface, of in pairs])
         self._labels = {view.name: keep(labels_of(view, cuts.segment)) for view in stereo}
         return cuts
 
@@ -103,10 +100,17 @@ def labels_of(view: StereoView, segment: np.ndarray) -> np.ndarray:
     return np.asarray(watershed(gradient, seeds), np.int32)
 
 
-def on_points(surface: Surface, cuts: Segmentation, points: np.ndarray) -> np.ndarray:
-    """[P] int32 segment of points [P, 3] in the cuts of a surface, 0 = none."""
-    voxel = surface.voxel_of(points.astype(np.float64))
-    return np.where(voxel >= 0, cuts.segment[voxel], 0)
+def segmented(views: list[StereoView], side: float = FOOTPRINTS) -> Segmentation | None:
+    """The segments of the surface that all photos show, on which those of the grids of SHIFTS agree most; None if there
+    is hardly a surface. side: of a voxel, in pixel footprints. The views are given the voxels of the first grid."""
+    surfaces = fuse(views, side, shifts=SHIFTS)
+    if min(map(len, surfaces)) < _LEAST_VOXELS:
+        return None
+    first, *others = map(segmentation, surface_graphs(views, surfaces))
+    points = first.points.astype(np.float64)
+    voxels = [surface.voxel_of(points) for surface in surfaces[1:]]
+    at_points = [np.where(voxel >= 0, of.segment[voxel], 0) for voxel, of in zip(voxels, others, strict=True)]
+    return averaged(first, [(segment, of.probability) for segment, of in zip(at_points, others, strict=True)])
 
 
 def fuse(

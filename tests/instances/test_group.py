@@ -215,6 +215,27 @@ def test_small_things_on_a_table_are_kept_though_features_do_not_part_them() -> 
     assert found.count == 4 and adjusted_rand_score(truth, found.ids) > 0.99
 
 
+def test_labels_of_one_surface_are_the_instances_whatever_features_and_seed_say() -> None:
+    rng = np.random.default_rng(0)
+    truth = np.repeat(np.arange(4), [500, 200, 60, 20])
+    names = np.array([7, 2, 40, 5])  # of the things, in all photos; the last photo does not show the first
+    owner = np.append(np.tile(np.arange(4), 5), [1, 2, 3])
+    weights = 5 * (owner == truth[:, None]) + rng.uniform(0, 1.5, (len(truth), len(owner)))  # and some in wrong ones
+    view = np.append(np.repeat(np.arange(5), 4), [5] * 3)
+    none = sparse.csr_matrix((len(truth), 6), dtype=np.float32)
+    votes = MaskVotes(sparse.csr_matrix(weights, dtype=np.float32), none, view, weights.sum(axis=0), names[owner])
+    sums = votes.of_labels().toarray()
+    for column, name in enumerate(sorted(names)):
+        np.testing.assert_allclose(sums[:, column], weights[:, names[owner] == name].sum(axis=1), rtol=1e-5)
+    means, shape, opaque = rng.normal(0, 0.1, (len(truth), 3)) + 3 * truth[:, None], np.full((len(truth), 3), 0.1), 0.9
+    opacities = np.full(len(truth), opaque)
+    opacities[:3] = 0.01  # too faint to found an instance, and joined to that of its neighbours
+    for seed in range(2):
+        noise = np.random.default_rng(seed).normal(size=(len(truth), 8))
+        found = group(means, shape, opacities, noise, votes, InstanceConfig(), seed=seed, one_surface=True)
+        np.testing.assert_array_equal(found.ids, truth)
+
+
 def test_an_object_cut_by_every_border() -> None:
     scene = make_scene(row(1), CODES[:1, :8], orbit(6, 0.55, 0.1, np.zeros(3)), radius=0.5, each=600)
     found = run(scene)

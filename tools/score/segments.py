@@ -4,10 +4,11 @@ python tools score.segments [--depth] SCENE...
 
 Scenes are those of docs/benchmarks.md, read by stereo as in `training.masks`, without training a map. A thing is found
 where a union of patches, a region of the tree, a region of the cut, or a segment has an IoU above 0.5 with it, in
-voxels. Two things are joined where one segment holds more than half of each: by patches, if more than half of the
-smaller one lies in patches that are mostly of other things; else by the networks, if the first region with half of each
-comes from a merge of odds above even; else by the cut. Last, the share of THRESHOLDS of IoU that the best label of each
-thing passes, pixels of all photos together: of labels as their voxels are, and as their borders moved to the photos'.
+voxels; "averaged": a segment on which three grids of voxels agree, with which the photos are labelled. Two things are
+joined where one segment holds more than half of each: by patches, if more than half of the smaller one lies in patches
+that are mostly of other things; else by the networks, if the first region with half of each comes from a merge of odds
+above even; else by the cut. Last, the share of THRESHOLDS of IoU that the best label of each thing passes, pixels of
+all photos together: of labels as their voxels are, and as their borders moved to the photos'.
 --depth: depth as of a camera.
 """
 
@@ -21,16 +22,16 @@ from typing import Any
 import numpy as np
 
 from perception.bench.output import Column, table
-from perception.masks.builtin import labels_of
+from perception.masks.builtin import labels_of, segmented
 from perception.masks.cues import filled
 from perception.masks.merging import REGION_COLUMNS, MergeTree, divided, read_model, tree_by
 from perception.masks.surface import FOOTPRINTS
 from score.instances import read_scene as read_truth
 from support.mask_scores import leaf_sums
-from training.masks import LEAST, Reading, read_scene, world_of
+from training.masks import LEAST, Reading, World, read_scene, world_of
 
 FOUND, THRESHOLDS, LEAST_PIXELS = 0.5, np.arange(0.5, 1, 0.05), 500
-STAGES, CAUSES = ("patches", "tree", "cut", "segments"), ("patches", "network", "cut")
+STAGES, CAUSES = ("patches", "tree", "cut", "segments", "averaged"), ("patches", "network", "cut")
 COLUMNS: tuple[Column, ...] = (
     ("things", "things", "d"),
     *((name, f"in_{name}", "d") for name in STAGES),
@@ -89,27 +90,35 @@ def of_voxels(voxel: np.ndarray, segment: np.ndarray) -> np.ndarray:
     return filled(labels, labels > 0) if labels.any() else labels
 
 
+def by_thing(segment: np.ndarray, world: World) -> np.ndarray:
+    """[S + 1, T] voxels of each segment by thing; none of segment 0, small patches without neighbours."""
+    shared = np.zeros((int(segment.max()) + 1, world.votes.shape[1]))
+    np.add.at(shared, (segment, world.truth), 1)
+    shared[0] = 0
+    return shared
+
+
 def row_of(folder: Path, stereo: bool) -> dict[str, Any]:
     """The line of one scene."""
     reading = read_scene(folder, stereo, side=FOOTPRINTS)
     world, model = world_of(reading), read_model()
     tree = tree_by(model, world.graph)
     segment, _ = divided(world.graph, tree, model)
-    segments = np.zeros((int(segment.max()) + 1, world.votes.shape[1]))
-    np.add.at(segments, (segment, world.truth), 1)
-    segments[0] = 0  # small patches without neighbours
+    cuts = segmented(reading.views, reading.side)
+    assert cuts is not None  # for the type checker
+    segments, mean = (by_thing(of, world) for of in (segment, cuts.segment))
     votes, regions = world.votes, leaf_sums(tree, world.votes)
     sizes, cut = votes.sum(axis=0), np.unique(tree.cut(model.probabilities(tree)[0] - model.cost))
     ids = [int(entry["id"]) for entry in read_truth(folder)["instances"] if not entry["is_stuff"]]
     things = [thing for thing in ids if thing < len(sizes) and sizes[thing] >= LEAST]
-    ious = (union_iou(votes), *(best_iou(sets, sizes) for sets in (regions, regions[cut], segments)))
+    ious = (union_iou(votes), *(best_iou(sets, sizes) for sets in (regions, regions[cut], segments, mean)))
     return {
         "place": folder.name,
         "things": len(things),
         **{f"in_{name}": int((iou[things] > FOUND).sum()) for name, iou in zip(STAGES, ious, strict=True)},
         **{f"by_{name}": count for name, count in joined_by(votes, tree, segments, things).items()},
-        "voxels": share_passed(reading, [of_voxels(view.voxel, segment) for view in reading.views]),
-        "labels": share_passed(reading, [labels_of(view, segment) for view in reading.views]),
+        "voxels": share_passed(reading, [of_voxels(view.voxel, cuts.segment) for view in reading.views]),
+        "labels": share_passed(reading, [labels_of(view, cuts.segment) for view in reading.views]),
     }
 
 
