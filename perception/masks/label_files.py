@@ -12,6 +12,8 @@ from perception.io.atomic import atomic_file
 from perception.io.documents import safe_name
 from perception.types import View
 
+LARGEST = 65535
+"""The largest label that 16 bits hold. With larger ones, equal labels of two photos are of different things."""
 _KEY = "perception-masks"
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
@@ -36,11 +38,11 @@ def write_labels(file: Path, labels: np.ndarray, key: str = "") -> None:
     """labels: [h, w] integers ≥ 0. Ids that exceed 16 bit are renumbered from 1."""
     from PIL import Image, PngImagePlugin
 
-    if labels.max(initial=0) > 65535:
+    if labels.max(initial=0) > LARGEST:
         unique, inverse = np.unique(labels, return_inverse=True)
         labels = inverse.reshape(labels.shape) + int(unique[0] != 0)
-    if labels.min(initial=0) < 0 or labels.max(initial=0) > 65535:
-        raise ValueError(f"{file}: labels must lie in 0..65535, found {labels.min()}..{labels.max()}")
+    if labels.min(initial=0) < 0 or labels.max(initial=0) > LARGEST:
+        raise ValueError(f"{file}: labels must lie in 0..{LARGEST}, found {labels.min()}..{labels.max()}")
     info = PngImagePlugin.PngInfo()
     info.add_text(_KEY, key)
     with atomic_file(file, parents=True) as aside:

@@ -26,6 +26,7 @@ from perception.language.description import to_arrays
 from perception.language.ocr import TextReader
 from perception.machine import return_free_memory
 from perception.map.map import prefixed
+from perception.masks.label_files import LARGEST
 from perception.masks.merging import Segmentation
 from perception.pipeline.optimise import Optimised, Run
 from perception.progress import Progress
@@ -64,7 +65,8 @@ def group_gaussians(optimised: Optimised, run: Run, segments: Segmentation | Non
     tensors = (gaussians.means, gaussians.scales, gaussians.opacities, gaussians.features)
     means, scales, opacities, features = (tensor.detach().numpy() for tensor in tensors)
     margin = config.losses.margin
-    arrays, one_surface = (means, scales, opacities, features, votes), segments is not None
+    arrays = (means, scales, opacities, features, votes)
+    one_surface = segments is not None and len(segments.probability) <= LARGEST + 1
     grouping = group(*arrays, config.instances, margin=margin, seed=config.seed, one_surface=one_surface)
     return grouping if segments is None else without_faint(grouping, means, opacities, votes, segments)
 
