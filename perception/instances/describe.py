@@ -6,6 +6,7 @@ l_i = (1 / KL) Σ_k Σ_l l_ikl    over the L crops of the K best views, each of 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,8 +22,18 @@ AT_ONCE = 24  # crops from which they are encoded together, so that no thread wa
 Load = Callable[[int], tuple[np.ndarray, np.ndarray]]
 
 
+@dataclass(frozen=True)
+class Unread:
+    """Stands for an encoder where only the views, boxes and colours of instances are wanted: embeddings are zeros."""
+
+    dim: int
+
+    def encode_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
+        return np.zeros((len(images), self.dim), np.float32)
+
+
 def describe_instances(
-    encoder: Encoder,
+    encoder: Encoder | Unread,
     choices: Sequence[np.ndarray],
     load: Load,
     view_names: Sequence[str],

@@ -15,7 +15,7 @@ from perception.boxes import instance_entry
 from perception.gaussians.model import Gaussians, Nearby
 from perception.gaussians.views import TrainingView, half_camera
 from perception.instances.crops import choose_views, view_scores
-from perception.instances.describe import describe_instances
+from perception.instances.describe import Unread, describe_instances
 from perception.instances.group import Grouping, group
 from perception.instances.levels import without_faint
 from perception.instances.silhouettes import Silhouettes, render_silhouettes
@@ -93,21 +93,25 @@ def describe(
         store_texts(described.instances, texts)
         return_free_memory()
 
-    def embedded(ids: np.ndarray, seen: list[Silhouettes], best: int, zooms: int) -> dict[str, np.ndarray]:
-        """Language arrays of all instances (eq. 11) from their `best` views (eq. 10), `zooms` crops of each."""
+    def embedded(
+        ids: np.ndarray, seen: list[Silhouettes], best: int, zooms: int, read: bool = True
+    ) -> dict[str, np.ndarray]:
+        """Language arrays of all instances (eq. 11) from their `best` views (eq. 10), `zooms` crops of each; if not
+        `read`, without embeddings."""
         if encoder is None:
             return {}
         choices, names = _best_views(ids, seen, best), [view.name for view in views]
         zooms = zooms or reading_of(encoder).zooms
-        shown = describe_instances(encoder, choices, lambda n: _shown(views[n], seen[n]), names, zooms, progress)
+        reads = encoder if read else Unread(encoder.dim)
+        shown = describe_instances(reads, choices, lambda n: _shown(views[n], seen[n]), names, zooms, progress)
         return to_arrays(shown, encoder.identity)
 
     if grouped.count:
         described.language = embedded(grouped.ids, seen, language.views, language.zooms)
     nodes = min(NODE_VIEWS, language.views)
     if grouped.parents:
-        wholes = encoder is not None and reading_of(encoder).wholes  # `upgrade` reads the views alone
-        arrays = embedded(part, parts_seen, 1, 1) if wholes else embedded(part, parts_seen, nodes, language.zooms)
+        wholes = encoder is not None and reading_of(encoder).wholes  # then only `upgrade` needs their views
+        arrays = embedded(part, parts_seen, *((1, 1, False) if wholes else (nodes, language.zooms)))
         described.parts = {"ids": grouped.part_ids, **prefixed(arrays)}
     if len(grouped.group_scores):
         arrays = prefixed(embedded(levels[2], groups_seen, nodes, language.zooms))

@@ -51,7 +51,8 @@ class Nodes:
         self._kinds: list[InstanceSet] = []
         self._nodes: list[Node] = []
         parts = [part for entry in gmap.instances for part in entry.get("parts", [])]
-        if parts and (language := language_in(gmap.parts)) and "ids" in gmap.parts:
+        language = language_in(gmap.parts)
+        if parts and language and language["embeddings"].any() and "ids" in gmap.parts:
             parts.sort(key=lambda part: int(part["id"]))
             kind = InstanceSet(gmap, parts, language, gmap.parts["ids"])
             self._add(kind, True, [[row_of[part["parent"]]] for part in parts])

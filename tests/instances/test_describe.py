@@ -17,7 +17,7 @@ from perception.instances.crops import (
     mask_box,
     view_scores,
 )
-from perception.instances.describe import describe_instances
+from perception.instances.describe import Unread, describe_instances
 from perception.language.colors import palette
 from support.progress import Told
 
@@ -111,3 +111,19 @@ def test_palette_comes_from_the_mask_alone() -> None:
     photo[20:40, 20:40], ids[20:40, 20:40] = (255, 0, 0), 0
     found = describe_instances(MeanColor(), [np.array([0])], lambda _: (photo, ids), ["a.jpg"])
     assert np.allclose(found[0].palette, palette(np.array([[255, 0, 0]], np.uint8)), atol=1e-4)
+
+
+def test_unread_gives_the_views_boxes_and_colours_of_any_encoder_and_no_embedding() -> None:
+    rng = np.random.default_rng(0)
+    photos = rng.integers(0, 256, (3, 30, 40, 3), np.uint8)
+    ids = rng.integers(-1, 2, (3, 30, 40)).astype(np.int32)
+    choices = [np.array([2, 0]), np.array([1]), np.array([], int)]
+    both = [
+        describe_instances(encoder, choices, lambda n: (photos[n], ids[n]), ["a", "b", "c"], 1)
+        for encoder in (MeanColor(), Unread(3))
+    ]
+    for read, unread in zip(*both, strict=True):
+        assert (read.views, read.boxes) == (unread.views, unread.boxes)
+        np.testing.assert_array_equal(read.palette, unread.palette)
+        np.testing.assert_array_equal(unread.per_view, np.zeros_like(read.per_view))
+        np.testing.assert_array_equal(unread.embedding, np.zeros(3))

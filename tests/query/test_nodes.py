@@ -68,6 +68,21 @@ def test_parts_do_not_answer_where_the_encoder_knows_whole_objects(path: Path) -
     assert gmap.query("breakfast", top_k=1)[0].instances == (5, 6)
 
 
+def test_parts_without_embeddings_are_no_part_of_what_a_prompt_is_compared_with(path: Path, tmp_path: Path) -> None:
+    stored = read_map(path)
+    blank = {name: np.zeros_like(array) for name, array in stored.parts.items() if "embeddings" in name}
+    stored.parts = stored.parts | blank
+    write_map(tmp_path / "blank.gsmap", stored)
+    stored.parts = {"ids": stored.parts["ids"]}
+    for entry in stored.instances:
+        entry.pop("parts", None)
+    write_map(tmp_path / "without.gsmap", stored)
+    blanked, without = (load_map(tmp_path / f"{name}.gsmap", encoders) for name in ("blank", "without"))
+    for text in ("mug", "handle", "breakfast", "hollow"):
+        answers = [[hit.to_json() for hit in gmap.query(text, min_score=0.0)] for gmap in (blanked, without)]
+        assert answers[0] == answers[1] and len(answers[0]) >= 8
+
+
 def test_granularity_of_an_export(path: Path, tmp_path: Path) -> None:
     gmap = read_map(path)
     ids, entries = at_granularity(gmap, "parts")
