@@ -46,12 +46,13 @@ from perception.masks.stereo import StereoView
 from perception.masks.surface import FOOTPRINTS
 from perception.masks.surface_graph import SurfaceGraph
 from support.mask_scores import leaf_sums
-from training import boundaries, clutter, patchwork
+from training import boundaries, clutter, furnished, patchwork
 from worlds import scene as scenes
 
 scenes.SCENES |= {"clutter": clutter, "patchwork": patchwork}
 PATCHWORK = (("patchwork", 4000, 2), ("patchwork", 4001, 2))  # first seed, step
-SCENES = (("clutter", 3100, 2), ("clutter", 3101, 2), ("room", 2000, 1), ("tabletop", 1000, 1), *PATCHWORK)
+FURNISHED = (("furnished", 5000, 2), ("furnished", 5001, 2))
+SCENES = (("clutter", 3100, 2), ("clutter", 3101, 2), ("room", 2000, 1), ("tabletop", 1000, 1), *PATCHWORK, *FURNISHED)
 KEPT = {"validation": (8, 18), "test": (9, 19)}  # numbers of sets that are not trained on
 PAIRS, LEAST = 8000, 20  # pairs of one world and round; voxels of a region that is learned from
 VIEWS = 9  # of a reading that borders are learned from
@@ -65,7 +66,7 @@ PAIR_SIZE |= {f"{which}_{name}": 1 for which in ("larger", "smaller") for name i
 REGION_SIZE = {"area": 2, **dict.fromkeys(EXTENTS, 1)}  # and of regions
 RENDERED, SENSED = 0.1, 0.025  # relative errors of depth; the latter make flat patches as thick as a Kinect's are
 POSES = 0.005  # errors of poses: radians, and relative to the median depth
-SIDES = (3.0, 5.0)  # of voxels, in pixel footprints
+SIDES = (2.5, 5.0)  # of voxels, in pixel footprints
 GOALS = ("AP", "AP50", "AP25", "reach")
 COLUMNS: tuple[Column, ...] = tuple((name, name.lower(), ".3f") for name in (*GOALS, "ECE"))
 Samples = tuple[np.ndarray, ...]  # inputs [P, F], targets [P, O], weights [P]
@@ -180,8 +181,11 @@ def make_reading(folder: Path, stereo: bool) -> Reading:
     if not file.is_file():
         scene, seed = folder.name.split("_")
         if not (folder / "scene.json").is_file():
-            size = {"width": 320, "height": 240, "views": 26 if scene == "room" else 20, "light_samples": 6}
-            scenes.make_photos(folder / "images", scene=scene, seed=int(seed), truth_folder=folder, **size)
+            if scene == "furnished":
+                furnished.finish(folder)
+            else:
+                size = {"width": 320, "height": 240, "views": 26 if scene == "room" else 20, "light_samples": 6}
+                scenes.make_photos(folder / "images", scene=scene, seed=int(seed), truth_folder=folder, **size)
         file.with_suffix(".part").write_bytes(pickle.dumps(tuple(vars(read_scene(folder, stereo)).values())))
         file.with_suffix(".part").replace(file)
     return Reading(*pickle.loads(file.read_bytes()))
@@ -363,7 +367,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         groups: dict[str, list[World]] = {}
         jobs = jobs_of(options.work, KEPT["test"])
         for (folder, stereo), world in zip(jobs, made_worlds(jobs, borders, pool), strict=True):
-            kind = "patchwork" if folder.name.startswith("patchwork") else "test"
+            scene = folder.name.partition("_")[0]
+            kind = scene if scene in ("patchwork", "furnished") else "test"
             groups.setdefault(f"{kind}, {'stereo' if stereo else 'sensor'}", []).append(world)
         groups["all of them"] = list(chain(*groups.values()))
         for scene, stereo in product(options.scenes, (False, True)):
