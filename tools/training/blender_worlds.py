@@ -1,4 +1,4 @@
-"""Path-traced worlds of modelled things, to train the built-in masks on.
+"""Renders path-traced worlds of modelled things in Blender, to train the built-in masks on.
 
 BLENDER tools/training/blender_worlds.py WORK MODELS
 
