@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 WEIGHTS = Path(__file__).with_name("boundary_weights.npz")
 REACH = 4  # pixels: whether the pixels this far to either side are of different things is what the network predicts
 INPUTS, OUTPUTS = 11, 3
-WIDTHS = (16, 24, 32, 48)  # channels at 1/2, 1/4, 1/8 and 1/16 of the resolution
+WIDTHS = (24, 32, 48, 64)  # channels at 1/2, 1/4, 1/8 and 1/16 of the resolution
 _STEP = 0.06  # largest step, relative to depth
 
 

@@ -24,7 +24,7 @@ from perception.masks.surface_graph import SurfaceGraph, patches, voxel_edges
 from perception.progress import QUIET, Progress
 from perception.types import View
 
-VERSION = 16  # increased whenever the label images change, so that cached ones are recomputed
+VERSION = 17  # increased whenever the label images change, so that cached ones are recomputed
 _SMOOTH = 0.03  # relative to the depth: a pixel with a larger depth step is not part of the surface
 _LEAST_VOXELS = 100
 SHIFTS = (0.0, 1 / 3, 2 / 3)  # of the voxels' grid, in their sides: the segmentations that are averaged

@@ -27,7 +27,7 @@ def test_truth_of_a_worlds_voxels_against_the_true_points(photographed, stereo):
     world = make_world(home, stereo)
     distance, near = cKDTree(made.points).query(world.graph.surface.points)
     close = (distance < world.graph.surface.size) & (world.truth > 0)
-    assert close.mean() > 0.2  # the cloud of true points is thin on walls
+    assert close.sum() > 2000  # the cloud of true points is thin on walls, and voxels are of several sizes
     assert (world.truth[close] == made.instance_ids[near[close]]).mean() > 0.85
     features, one, weights = pairs_of(world, plain_rule, 0)
     assert len(features) == len(one) == len(weights) > 50 and 0.1 < one.mean() < 0.95

@@ -13,7 +13,7 @@ from perception.masks.boundaries import OUTPUTS, REACH, forward, scaled, shapes
 if TYPE_CHECKING:
     from perception.masks.boundaries import Layers
 
-STEPS, BATCH = 2500, 8
+STEPS, BATCH = 5000, 8
 RATE = 3e-3
 THING = 0.3  # weight of the third output
 CHANNELS = {"lab": slice(0, 3), "normal x": 3, "geometry": slice(3, 11), "depth": 10}

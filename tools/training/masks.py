@@ -2,12 +2,13 @@
 
 python tools training.masks WORK
 
-Worlds are clutter, rooms, tabletops and patchwork by seed, in sets of six: 24 sets train, two choose the cost and the
-calibration, two are for testing. Each world is read twice, as maps with and without depth images see its surface. A
-network of object borders is trained first, then what tells pairs of patches and regions. Pairs are gathered along
-merges that the truth permits, in the order of a plain rule, then of the model so far (Nunez-Iglesias et al. 2013). WORK
-keeps the worlds and the first network, so that a run that was stopped goes on. On two cores, the worlds take 25 min and
-learning 40 min. Equal seeds give equal weights. The packaged ones are those of this command.
+Worlds are clutter, rooms, tabletops and patchwork by seed, and the path-traced ones that `blender_worlds` has written
+into WORK, in sets of eight: 24 sets train, two choose the cost and the calibration, two are for testing. Each world is
+read twice, as maps with and without depth images see its surface. A network of object borders is trained first, then
+what tells pairs of patches and regions. Pairs are gathered along merges that the truth permits, in the order of a plain
+rule, then of the model so far (Nunez-Iglesias et al. 2013). WORK keeps the worlds and the first network, so that a run
+that was stopped goes on. On two cores, the worlds take 30 min, the first network 35 min (of one), and learning
+40 min. Equal seeds give equal weights. The packaged ones are those of this command.
 """
 
 from __future__ import annotations
@@ -350,7 +351,7 @@ def spread(model: MergeModel, worlds: list[World]) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("work", type=Path, metavar="WORK", help="folder of the worlds")
-    parser.add_argument("--worlds", type=int, default=24, metavar="N", help="sets of six to train on (default 24)")
+    parser.add_argument("--worlds", type=int, default=24, metavar="N", help="sets of eight to train on (default 24)")
     parser.add_argument("--scenes", type=Path, nargs="*", default=[], metavar="SCENE", help="more scenes to test on")
     parser.add_argument(
         "--spread", type=int, default=1, metavar="N", help="read them N times, one photo less each time"
