@@ -7,8 +7,8 @@ into WORK, in sets of eight: 24 sets train, two choose the cost and the calibrat
 read twice, as maps with and without depth images see its surface. A network of object borders is trained first, then
 what tells pairs of patches and regions. Pairs are gathered along merges that the truth permits, in the order of a plain
 rule, then of the model so far (Nunez-Iglesias et al. 2013). WORK keeps the worlds and the first network, so that a run
-that was stopped goes on. On two cores, the worlds take 30 min, the first network 35 min (of one), and learning
-40 min. Equal seeds give equal weights. The packaged ones are those of this command.
+that was stopped goes on. On two cores, the worlds take 30 min, the first network 38 min (of one), and learning
+11 min. Equal seeds give equal weights. The packaged ones are those of this command.
 """
 
 from __future__ import annotations
