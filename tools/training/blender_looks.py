@@ -41,7 +41,7 @@ def pattern(rng: np.random.Generator, colours: int = 2, size: float = 0.1, contr
     ramp.color_ramp.elements[1].color = base + contrast * (np.array(colour_of(rng)) - base)
     place = tree.nodes.new("ShaderNodeTexCoord")
     tree.links.new(place.outputs["Object"], texture.inputs["Vector"])
-    values = next(out for out in texture.outputs if out.name in ("Fac", "Distance") or out.name == "Color")
+    values = next(out for out in texture.outputs if out.name in ("Fac", "Distance", "Color"))
     tree.links.new(values, ramp.inputs["Fac"])
     tree.links.new(ramp.outputs["Color"], shader.inputs["Base Color"])
     return material
