@@ -7,13 +7,18 @@ import math
 import os
 import resource
 import sys
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
+from typing import TypeVar
 
 from perception.errors import InputError
 
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 _CGROUPS, _OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 threads_before: ContextVar[int] = ContextVar("threads_before", default=0)
 """Threads that torch had outside `torch_on_one_thread`; 0 outside of it."""
@@ -23,6 +28,21 @@ def cores() -> int:
     """CPU cores of this process: those it may be scheduled on, and of its quota, rounded up."""
     quota = min((_cores_of(folder) for folder in _control_groups("cpu")), default=math.inf)
     return max(1, math.ceil(min(_scheduled(), quota)))
+
+
+def in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    """work(item) of each item, in order, as many at a time as there are `cores`; no more results wait than that."""
+    most, waiting = cores(), deque[Future[Result]]()
+    with ThreadPoolExecutor(most) as pool:
+        try:
+            for item in items:
+                waiting.append(pool.submit(work, item))
+                if len(waiting) > most:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def limit_threads() -> None:

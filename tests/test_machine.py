@@ -1,7 +1,8 @@
-"""Cores and memory that control groups grant, versions 1 and 2, on folders as the kernel shows them."""
+"""Cores and memory that control groups grant, versions 1 and 2, on folders as the kernel shows them; threads."""
 
 import os
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -71,3 +72,29 @@ def test_memory(groups: Callable, own: str, files: dict[str, str], expected: int
     assert 0 < module.available_memory() <= expected
     with pytest.raises(InputError, match=r"cloud: needs about .* are free; split it"):
         module.require_memory(expected, "cloud", "split it")
+
+
+def test_work_in_threads_comes_in_order_and_no_further_than_needed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Later items end first; none is begun while many results wait; the first error is raised and ends the rest."""
+    monkeypatch.setattr(module, "cores", lambda: 3)
+    begun, given = list[int](), list[int]()
+
+    def work(item: int) -> int:
+        begun.append(item)
+        time.sleep(0.02 if item % 3 == 0 else 0)
+        if item == 40:
+            raise ValueError(str(item))
+        return item * item
+
+    def items() -> Iterator[int]:
+        for item in range(60):
+            given.append(item)
+            yield item
+
+    found = module.in_threads(work, items())
+    assert [next(found) for _ in range(20)] == [n * n for n in range(20)]
+    assert max(given) <= 24
+    with pytest.raises(ValueError, match="40"):
+        list(found)
+    assert max(begun) <= 44
+    assert list(module.in_threads(work, [])) == []

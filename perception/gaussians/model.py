@@ -208,3 +208,10 @@ class Nearby:
             chosen = torch.from_numpy(rows).to(self.gaussians.means.device)
             self._last = parts, self.gaussians if parts is self._all else self.gaussians.rows(chosen), rows
         return self._last[1:]
+
+    def parts(self, photos: Sequence[str]) -> tuple[list[np.ndarray], list[list[int]]]:
+        """The rows of each part of the model that one of the photos may show, and of each photo the parts' numbers."""
+        of_photo = [self._rows.get(photo, self._all) for photo in photos]
+        known = {id(rows): rows for parts in of_photo for rows in parts}
+        number = {key: n for n, key in enumerate(known)}
+        return list(known.values()), [[number[id(rows)] for rows in parts] for parts in of_photo]

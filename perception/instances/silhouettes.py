@@ -9,12 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from perception.gaussians.model import Gaussians
+from perception.gaussians.model import Gaussians, Nearby
+from perception.gaussians.views import TrainingView, half_camera
 from perception.rasterizer.rasterize import rasterizer_for
 from perception.rasterizer.types import Settings
 
 MOST_LABELS = 1 << 24
 """The rasterizer takes smaller ids only; larger ones are numbered anew."""
+HALVED_FROM = 480
+"""Long side in pixels from which silhouettes are rendered at half the resolution, at a third of the time."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,17 @@ class Silhouettes:
     def ids(self) -> np.ndarray:
         """[H, W] int32: the instance with the largest weight in a pixel, −1 if it is below `threshold`."""
         return np.frombuffer(zlib.decompress(self.packed), np.int32).reshape(self.shape)
+
+
+def view_silhouettes(nearby: Nearby, levels: Sequence[np.ndarray], view: TrainingView) -> list[Silhouettes]:
+    """`render_silhouettes` of a photo, from HALVED_FROM on at half its resolution. levels: ids [N] int32 of all
+    Gaussians."""
+    K, (height, width), eps2d = view.K, view.photo.shape[:2], view.eps2d
+    if max(height, width) >= HALVED_FROM:
+        K, (height, width), eps2d = half_camera(K, (height, width), eps2d)
+    gaussians, rows = nearby.of(view.name)
+    owners = [ids[rows] for ids in levels]
+    return render_silhouettes(gaussians, owners, view.camera_from_world, K, width, height, eps2d=eps2d)
 
 
 @torch.no_grad()

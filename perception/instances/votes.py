@@ -7,7 +7,8 @@ the mask. One backward pass computes BLOCK masks for all Gaussians.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -28,7 +29,15 @@ FEW = 0.25  # share of the Gaussians; a view of fewer is rendered of these alone
 FAINTEST = 0.02  # pixels; smaller weights are dropped to keep the matrix sparse
 
 
-@torch_on_one_thread()
+@dataclass(frozen=True)
+class ViewVotes:
+    """Votes of one view. weights [N, 1 + M]: of its masks, in column 0 where it has none; labels, areas [1 + M]."""
+
+    weights: sparse.csc_matrix
+    labels: np.ndarray
+    areas: np.ndarray
+
+
 def mask_votes(
     nearby: Nearby,
     views: Sequence[TrainingView],
@@ -37,31 +46,35 @@ def mask_votes(
     progress: Progress | None = None,
     keep: Keep = np.asarray,
 ) -> MaskVotes:
-    """The votes of all masks of all views. Label 0 means unlabelled: such pixels count as void.
+    """The votes of all masks of all views, by `view_votes`. keep: where the weights are kept, which grow with photos ×
+    visible Gaussians."""
+    found = (view_votes(nearby, view, half_resolution) for view in views)
+    return joined_votes(found, len(nearby.gaussians), len(views), progress, keep)
 
-    half_resolution: uses every other pixel per axis, at a quarter of the time. Masks are smooth enough for this. Areas
-    are then in pixels of that size too. keep: where the weights are kept, which grow with photos × visible Gaussians.
-    """
+
+def joined_votes(
+    found: Iterable[ViewVotes | None], count: int, views: int, progress: Progress | None = None, keep: Keep = np.asarray
+) -> MaskVotes:
+    """The votes of all masks from those of each of that many views, None for one without masks; count: of Gaussians."""
     parts: list[sparse.csc_matrix] = []  # by column: a row pointer per view would be as large as the model
     voids: list[sparse.csc_matrix] = []
     owner: list[np.ndarray] = []
     areas: list[np.ndarray] = []
     labels: list[np.ndarray] = []
-    for index, view in enumerate(views):
-        shown = view.halved() if half_resolution and min(view.photo.shape[:2]) > 1 else view
-        if shown.labels is not None and bool((shown.labels > 0).any()):
-            weights, area, names = _of_view(nearby, shown)
-            parts.append(_kept(weights[:, 1:], keep))
-            voids.append(_kept(weights[:, :1], keep))
-            areas.append(area[1:])
-            labels.append(names[1:].astype(np.int64))
-            owner.append(np.full(len(area) - 1, len(owner), np.int64))
+    for index, one in enumerate(found):
+        if one is not None:
+            parts.append(_kept(one.weights[:, 1:], keep))
+            voids.append(_kept(one.weights[:, :1], keep))
+            areas.append(one.areas[1:])
+            labels.append(one.labels[1:].astype(np.int64))
+            owner.append(np.full(len(areas[-1]), len(owner), np.int64))
+        del one
         if index % TRIM == TRIM - 1:
             return_free_memory()
         if progress is not None:
-            progress.update("mask votes", index + 1, len(views))
+            progress.update("mask votes", index + 1, views)
     if not parts:
-        none = sparse.csr_matrix((len(nearby.gaussians), 0), dtype=np.float32)
+        none = sparse.csr_matrix((count, 0), dtype=np.float32)
         return MaskVotes(none, none, np.zeros(0, np.int64), np.zeros(0))
     columns = (np.concatenate(each) for each in (owner, areas, labels))
     return MaskVotes(beside(parts, keep), beside(voids, keep), *columns)
@@ -97,10 +110,18 @@ def beside(parts: list[sparse.csc_matrix], keep: Keep = np.asarray) -> sparse.cs
     return sparse.csr_matrix((values, columns, starts), shape=(len(free), width))
 
 
+@torch_on_one_thread()
 @torch.no_grad()
-def _of_view(nearby: Nearby, view: TrainingView) -> tuple[sparse.csc_matrix, np.ndarray, np.ndarray]:
-    """Weights [N, 1 + masks], areas and labels of one view. Column 0 holds the pixels that no mask covers."""
-    assert view.labels is not None  # checked by the caller
+def view_votes(nearby: Nearby, view: TrainingView, half_resolution: bool = True) -> ViewVotes | None:
+    """The votes of the masks of one view, None if it has none. Label 0 means unlabelled: such pixels count as void.
+
+    half_resolution: uses every other pixel per axis, at a quarter of the time. Masks are smooth enough for this. Areas
+    are then in pixels of that size too.
+    """
+    if half_resolution and min(view.photo.shape[:2]) > 1:
+        view = view.halved()
+    if view.labels is None or not bool((view.labels > 0).any()):
+        return None
     height, width = view.photo.shape[:2]
     names, dense = np.unique(np.append(view.labels.numpy(), 0), return_inverse=True)
     labels = torch.from_numpy(dense.reshape(-1)[:-1].reshape(height, width))
@@ -130,4 +151,4 @@ def _of_view(nearby: Nearby, view: TrainingView) -> tuple[sparse.csc_matrix, np.
         blocks.append((weights[row, column], rows[seen[row]], column + first))
     weights, row, column = map(np.concatenate, zip(*blocks, strict=True))
     table = sparse.csc_matrix((weights, (row, column)), shape=(len(nearby.gaussians), len(names)))
-    return table, np.bincount(dense.reshape(-1)[:-1], minlength=len(names)).astype(float), names
+    return ViewVotes(table, names, np.bincount(dense.reshape(-1)[:-1], minlength=len(names)).astype(float))

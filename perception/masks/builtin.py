@@ -6,6 +6,7 @@ Label ids are consistent across photos, because every photo shows the same segme
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +14,14 @@ import numpy as np
 from perception.errors import InputError
 from perception.geometry import move_points
 from perception.io.memory import Keep
+from perception.machine import in_threads
 from perception.masks.averaging import averaged
 from perception.masks.base import LoadImage, MaskSource
 from perception.masks.boundaries import WEIGHTS, boundaries, read_layers
 from perception.masks.cues import filled, photo_cues
 from perception.masks.merging import Segmentation, segmentation
 from perception.masks.stereo import StereoView, make_stereo_view, measure_depths
-from perception.masks.surface import FOOTPRINTS, Surface, SurfaceBuilder
+from perception.masks.surface import FOOTPRINTS, Surface, SurfaceBuilder, pixels_of
 from perception.masks.surface_graph import SurfaceGraph, patches, voxel_edges
 from perception.progress import QUIET, Progress
 from perception.types import View
@@ -65,7 +67,8 @@ class BuiltinSegmentation(MaskSource):
         cuts = segmented(stereo)
         if cuts is None:
             return None
-        self._labels = {view.name: keep(labels_of(view, cuts.segment)) for view in stereo}
+        images = in_threads(partial(labels_of, segment=cuts.segment), stereo)
+        self._labels = {view.name: keep(labels) for view, labels in zip(stereo, images, strict=True)}
         return cuts
 
     def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
@@ -123,13 +126,18 @@ def fuse(
     layers = read_layers(weights)
     footprints = np.concatenate([(view.depth[::4, ::4] / view.K[0, 0]).ravel() for view in views])
     builders = [SurfaceBuilder(side * float(np.median(footprints)), shift) for shift in shifts]
-    for view in views:
+
+    def pixels(view: StereoView) -> tuple[np.ndarray, np.ndarray]:
         photo, depth = view.cues()
-        view.learned = view.keep(boundaries(photo, depth, layers).astype(np.float16))
-        border = 1 / (1 + np.exp(-view.learned[:2].max(axis=0).astype(np.float32)))
+        learned = boundaries(photo, depth, layers).astype(np.float16)
+        border = 1 / (1 + np.exp(-learned[:2].max(axis=0).astype(np.float32)))
         known = view.confirmed & (depth.step.max(axis=0) < _SMOOTH)
+        return learned, pixels_of(photo, depth, border, known, view.world_from_camera)
+
+    for view, (learned, shown) in zip(views, in_threads(pixels, views), strict=True):
+        view.learned = view.keep(learned)
         for builder in builders:
-            builder.add(photo, depth, border, known, view.world_from_camera)
+            builder.add(shown)
     return [builder.build() for builder in builders]
 
 
@@ -140,14 +148,19 @@ def surface_graphs(views: list[StereoView], surfaces: Sequence[Surface]) -> list
     for surface in surfaces:
         edges = voxel_edges(surface)
         graphs.append(SurfaceGraph(surface, patches(surface, edges), edges))
-    for view in views:
+
+    def evidence(view: StereoView) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]]]:
         photo, depth = view.cues()
         points, learned = move_points(view.world_from_camera, depth.points.astype(np.float64)), view.learned
         voxels = [surface.voxel_of(points) for surface in surfaces]
-        for graph, voxel in zip(graphs, voxels, strict=True):
-            regions = np.where(voxel >= 0, graph.patch[voxel], -1)
-            graph.add(regions, photo, depth, np.asarray(learned, np.float32))
-        view.voxel = view.keep(voxels[0])
+        regions = [np.where(voxel >= 0, graph.patch[voxel], -1) for graph, voxel in zip(graphs, voxels, strict=True)]
+        floats = np.asarray(learned, np.float32)
+        return voxels[0], [g.evidence(shown, photo, depth, floats) for g, shown in zip(graphs, regions, strict=True)]
+
+    for view, (voxel, found) in zip(views, in_threads(evidence, views), strict=True):
+        view.voxel = view.keep(voxel)
+        for graph, of_photo in zip(graphs, found, strict=True):
+            graph.add(*of_photo)
     for graph in graphs:
         graph.link()
     return graphs

@@ -54,15 +54,9 @@ class SurfaceBuilder:
         self.size, self.origin = size, shift * size
         self._keys, self._sums = np.zeros(0, np.int64), np.zeros((0, _BORDER + 1))
 
-    def add(
-        self, photo: PhotoCues, depth: DepthCues, border: np.ndarray, known: np.ndarray, world_from_camera: np.ndarray
-    ) -> None:
-        """Adds one photo. border: [h, w] probability; known: [h, w] bool, pixels with reliable depth;
-        world_from_camera: [4, 4]."""
-        points = move_points(world_from_camera, depth.points[known].astype(np.float64))
-        normals = depth.normals[known] @ world_from_camera[:3, :3].T
-        columns = [np.ones((len(points), 1)), points, normals, photo.lab[known], border[known][:, None]]
-        self._merge(voxel_keys(points - self.origin, self.size), np.concatenate(columns, axis=1))
+    def add(self, pixels: np.ndarray) -> None:
+        """Adds the `pixels_of` a photo."""
+        self._merge(voxel_keys(pixels[:, _POINT] - self.origin, self.size), pixels)
 
     def _merge(self, keys: np.ndarray, values: np.ndarray) -> None:
         """Adds values [P, C] to the sums of voxels keys [P]; too many voxels are made eight times as large."""
@@ -86,6 +80,17 @@ class SurfaceBuilder:
         return Surface(
             self.size, self.origin, self._keys[rows], sums[:, _COUNT], points, normals.astype(np.float32), lab, border
         )
+
+
+def pixels_of(
+    photo: PhotoCues, depth: DepthCues, border: np.ndarray, known: np.ndarray, world_from_camera: np.ndarray
+) -> np.ndarray:
+    """[P, _BORDER + 1] what each pixel of a photo adds to its voxel. border: [h, w] probability; known: [h, w] bool,
+    pixels with reliable depth; world_from_camera: [4, 4]."""
+    points = move_points(world_from_camera, depth.points[known].astype(np.float64))
+    normals = depth.normals[known] @ world_from_camera[:3, :3].T
+    columns = [np.ones((len(points), 1)), points, normals, photo.lab[known], border[known][:, None]]
+    return np.concatenate(columns, axis=1)
 
 
 def position_in(ascending: np.ndarray, keys: np.ndarray) -> np.ndarray:

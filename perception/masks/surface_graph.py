@@ -92,17 +92,21 @@ class SurfaceGraph:
         self._border[:, CONTACT] = contact
         self.borders: list[dict[int, np.ndarray]] = []
 
-    def add(self, regions: np.ndarray, photo: PhotoCues, depth: DepthCues, learned: np.ndarray) -> None:
-        """Adds the evidence of one photo. regions: [h, w] patch of each pixel, −1 = none; learned: [3, h, w], see
-        `perception.masks.boundaries.boundaries`."""
+    def evidence(
+        self, regions: np.ndarray, photo: PhotoCues, depth: DepthCues, learned: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
+        """The evidence of one photo, to be added. regions: [h, w] patch of each pixel, −1 = none; learned: [3, h, w],
+        see `perception.masks.boundaries.boundaries`."""
         inside = regions >= 0
-        flat = regions[inside]
         z = depth.points[..., 2]
+        shown, flat = _numbered(regions[inside], self.count)
         maps = [np.ones(len(flat)), *photo.lab[inside].T, photo.texture[inside], z[inside]]
-        self.sums[:, :VOXELS] += sums_by(flat, np.stack(maps, axis=1), self.count)
-        bins = flat.astype(np.int64) * COLOUR_BINS + photo.colour_bin[inside]
-        self.sums[:, COLOURS] += np.bincount(bins, minlength=self.count * COLOUR_BINS).reshape(-1, COLOUR_BINS)
-        self.sums[:, THING] += np.bincount(flat, learned[2][inside], self.count)
+        sums = np.zeros((len(shown), THING + 1))
+        sums[:, :VOXELS] = sums_by(flat, np.stack(maps, axis=1), len(shown))
+        bins = flat * COLOUR_BINS + photo.colour_bin[inside]
+        sums[:, COLOURS] = np.bincount(bins, minlength=len(shown) * COLOUR_BINS).reshape(-1, COLOUR_BINS)
+        sums[:, THING] = np.bincount(flat, learned[2][inside], len(shown))
+        found = [shown, sums]
         for axis in (0, 1):
             first, second = neighbours(regions, axis)
             cut = (first != second) & (first >= 0) & (second >= 0)
@@ -115,7 +119,14 @@ class SurfaceGraph:
             columns += [np.clip(-bend, 0, 1), np.clip(bend, 0, 1), odds]
             touching = border >= 0
             values = np.stack(columns, axis=1)[touching]
-            self._border[:, :CONTACT] += sums_by(border[touching], values, len(self._keys))
+            found.append(sums_by(border[touching], values, len(self._keys)))
+        return tuple(found)
+
+    def add(self, shown: np.ndarray, sums: np.ndarray, *borders: np.ndarray) -> None:
+        """Adds the `evidence` of one photo."""
+        self.sums[shown] += sums
+        for border in borders:
+            self._border[:, :CONTACT] += border
 
     def link(self) -> None:
         """Builds `borders`. Call it after all photos are added."""
@@ -167,6 +178,13 @@ class SurfaceGraph:
                 total = self.borders[a][other] + row if other in self.borders[a] else row
                 self.borders[a][other] = self.borders[other][a] = total
         self.borders[b] = {}
+
+
+def _numbered(values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The distinct of `values` [P], 0 … count − 1, and the number of each value among them [P] int64."""
+    present = np.zeros(count, bool)
+    present[values] = True
+    return np.flatnonzero(present), (np.cumsum(present) - 1)[values]
 
 
 def neighbours(image: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:

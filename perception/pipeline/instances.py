@@ -12,15 +12,15 @@ from scipy import sparse
 
 from perception import _core
 from perception.boxes import instance_entry
-from perception.gaussians.model import Gaussians, Nearby
-from perception.gaussians.views import TrainingView, half_camera
+from perception.gaussians.model import Gaussians
+from perception.gaussians.views import TrainingView
 from perception.instances.crops import choose_views, view_scores
 from perception.instances.describe import Unread, describe_instances
 from perception.instances.group import Grouping, group
 from perception.instances.levels import without_faint
-from perception.instances.silhouettes import Silhouettes, render_silhouettes
+from perception.instances.silhouettes import Silhouettes, view_silhouettes
 from perception.instances.texts import read_texts, store_texts
-from perception.instances.votes import mask_votes
+from perception.instances.votes import joined_votes, view_votes
 from perception.language.base import Encoder, reading_of
 from perception.language.description import to_arrays
 from perception.language.ocr import TextReader
@@ -29,10 +29,8 @@ from perception.map.map import prefixed
 from perception.masks.label_files import LARGEST
 from perception.masks.merging import Segmentation
 from perception.pipeline.optimise import Optimised, Run
-from perception.progress import Progress
+from perception.pipeline.photo_tasks import by_tasks, silhouettes_by_tasks, votes_by_tasks
 
-HALVED_FROM = 480
-"""Long side in pixels from which silhouettes are rendered at half the resolution, at a third of the time."""
 NODE_VIEWS = 3
 """Views of each part and group that are embedded. By one crop of each, some of the many look like what is not there."""
 
@@ -59,8 +57,10 @@ def group_gaussians(optimised: Optimised, run: Run, segments: Segmentation | Non
         return None
     run.progress.log(f"grouping {len(nearby.gaussians)} Gaussians")
     return_free_memory()
-    half = config.losses.half_resolution
-    votes = mask_votes(nearby, views, half_resolution=half, progress=run.progress, keep=run.new_keep())
+    count, half = len(nearby.gaussians), config.losses.half_resolution
+    here = (view_votes(nearby, view, half) for view in views)
+    found = votes_by_tasks(run, optimised) if by_tasks(run, optimised) else here
+    votes = joined_votes(found, count, len(views), run.progress, run.new_keep())
     gaussians = nearby.gaussians.to("cpu")
     tensors = (gaussians.means, gaussians.scales, gaussians.opacities, gaussians.features)
     means, scales, opacities, features = (tensor.detach().numpy() for tensor in tensors)
@@ -84,7 +84,7 @@ def describe(
     part = np.where(grouped.part_ids >= 0, grouped.part_ids - grouped.count, -1).astype(np.int32)
     group_of = np.append(grouped.groups, -1).astype(np.int32)  # the last for Gaussians without an instance
     levels = [grouped.ids, part, group_of[grouped.ids] if len(grouped.group_scores) else np.full_like(part, -1)]
-    seen, parts_seen, groups_seen = _silhouettes(nearby, levels, views, progress) if grouped.count else ([], [], [])
+    seen, parts_seen, groups_seen = _silhouettes(optimised, levels, run) if grouped.count else ([], [], [])
     described = DescribedInstances(grouped.ids, grouped.membership, _entries(grouped, nearby.gaussians.to("cpu"), seen))
     if reader is not None and grouped.count:
         choices = _best_views(grouped.ids, seen, language.views)
@@ -127,19 +127,13 @@ def describe(
     return described
 
 
-def _silhouettes(
-    nearby: Nearby, levels: list[np.ndarray], views: list[TrainingView], progress: Progress
-) -> list[list[Silhouettes]]:
+def _silhouettes(optimised: Optimised, levels: list[np.ndarray], run: Run) -> list[list[Silhouettes]]:
     """Of each level, the silhouettes of all views."""
-    seen = []
-    for done, view in enumerate(views, start=1):
-        K, (height, width), eps2d = view.K, view.photo.shape[:2], view.eps2d
-        if max(height, width) >= HALVED_FROM:
-            K, (height, width), eps2d = half_camera(K, (height, width), eps2d)
-        gaussians, rows = nearby.of(view.name)
-        owners = [ids[rows] for ids in levels]
-        seen.append(render_silhouettes(gaussians, owners, view.camera_from_world, K, width, height, eps2d=eps2d))
-        progress.update("silhouettes", done, len(views))
+    seen, views = [], optimised.photos.views
+    here = (view_silhouettes(optimised.nearby, levels, view) for view in views)
+    for of_view in silhouettes_by_tasks(run, optimised, levels) if by_tasks(run, optimised) else here:
+        seen.append(of_view)
+        run.progress.update("silhouettes", len(seen), len(views))
     _core.rasterizer_release_memory()  # hundreds of MiB, next to which the encoder's activations would lie
     return_free_memory()
     return [list(level) for level in zip(*seen, strict=True)]

@@ -238,7 +238,8 @@ def test_merging_patches_keeps_the_evidence_exact():
         for shown in seen:
             photo, depth = shown.cues()
             voxel = surface.voxel_of(move_points(shown.world_from_camera, depth.points.astype(float)))
-            graph.add(np.where(voxel >= 0, patch[voxel], -1), photo, depth, shown.learned.astype(np.float32))
+            regions = np.where(voxel >= 0, patch[voxel], -1)
+            graph.add(*graph.evidence(regions, photo, depth, shown.learned.astype(np.float32)))
         graph.link()
         return graph
 
@@ -508,7 +509,8 @@ def test_segments_do_not_depend_on_the_order_of_patches():
     for shown in seen:
         photo, depth = shown.cues()
         voxel = surface.voxel_of(move_points(shown.world_from_camera, depth.points.astype(float)))
-        second.add(np.where(voxel >= 0, second.patch[voxel], -1), photo, depth, shown.learned.astype(np.float32))
+        regions = np.where(voxel >= 0, second.patch[voxel], -1)
+        second.add(*second.evidence(regions, photo, depth, shown.learned.astype(np.float32)))
     second.link()
     (labels, probability), (others, _) = (divided(g, tree_by(read_model(), g), read_model()) for g in (first, second))
     np.testing.assert_array_equal(labels, others)

@@ -21,15 +21,16 @@ from perception.gaussians.stereo import visible_points
 from perception.geometry import camera_centres
 from perception.map.write import Map
 from perception.pipeline import blocks as module
+from perception.pipeline import photo_tasks
 from perception.pipeline.blocks import APART, cut, joined, nearby_rows, optimise_block
 from perception.pipeline.checkpoint import work_folder
 from perception.pipeline.mapping import build_map
 from perception.pipeline.optimise import Run
-from perception.progress import Progress
 from perception.tasks.engine import Engine
-from perception.tasks.folder import TASK, versions
+from perception.tasks.folder import TASK, versions, write_task
 from perception.types import Scene, View
 from support.aimed import look_at
+from support.elsewhere import Elsewhere
 from support.interrupts import interrupt_at
 from support.row_scene import centres, write_row
 
@@ -230,7 +231,7 @@ def test_a_worker_of_another_version_is_refused(tmp_path: Path) -> None:
 class KilledOnce(Engine):
     """An engine whose first task kills its worker in the middle of the training, once."""
 
-    def run(self, task: Callable[..., Any], folders: Sequence[str], what: str, progress: Progress) -> None:
+    def run(self, task: Callable[..., Any], folders: Sequence[str], *rest: Any) -> list[Any]:
         mark = Path(folders[0]).parents[1] / "killed"
 
         def killed(folder: str) -> None:  # runs in the worker, which cannot import this module
@@ -251,7 +252,7 @@ class KilledOnce(Engine):
             checkpoint.TrainingObserver.after_step = after_step  # type: ignore[method-assign]
             task(folder)
 
-        super().run(killed, folders, what, progress)
+        return super().run(killed, folders, *rest)
 
 
 @pytest.mark.slow
@@ -263,6 +264,29 @@ def test_ray_gives_the_same_map_although_a_worker_is_killed(
     made = build_map(row, tmp_path / "m.gsmap", settings(row), engine=KilledOnce("ray"))
     assert (tmp_path / "killed").exists()
     same(made, whole)
+
+
+@pytest.mark.slow
+def test_votes_and_silhouettes_of_other_machines_are_those_made_here(
+    row: Path, whole: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tasks that have nothing but their folders, each run twice, of photos that see one block or two."""
+    monkeypatch.setattr(photo_tasks, "PHOTOS_A_TASK", 7)
+    engine, shown = Elsewhere(), list[list[list[int]]]()
+
+    def noted(folder: Path, scene: Scene, **facts: Any) -> None:
+        shown.append(facts["parts"])
+        write_task(folder, scene, **facts)
+
+    monkeypatch.setattr(photo_tasks, "write_task", noted)
+    made = build_map(row, tmp_path / "m.gsmap", settings(row), engine=engine)
+    sets = -(-sum(not view.held_out for view in whole.views) // 7)
+    assert engine.asked[-2:] == [sets, sets] and len(shown) == 2 * sets
+    assert {len(parts) for task in shown for parts in task} >= {1, 2}
+    same(made, whole)
+    assert made.instances == whole.instances
+    np.testing.assert_array_equal(made.membership, whole.membership)
+    assert not work_folder(tmp_path / "m.gsmap").exists()
 
 
 def test_no_cluster_at_an_address_is_one_line() -> None:
