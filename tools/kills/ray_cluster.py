@@ -2,9 +2,9 @@
 
 python tools kills.ray_cluster        # a quarter of an hour on two cores
 
-A row of things with given poses is mapped in blocks, a tabletop from photos alone, with features, matches and submodels
-by tasks. Every map must be that of the local engine. Of every kind of task a worker must have been killed, and the
-driver while one ran. Nodes are processes of one machine, with one core each.
+A row of things with given poses is mapped in blocks, with votes and silhouettes by tasks; a tabletop from photos alone,
+with features, matches and submodels by tasks. Every map must be that of the local engine. Of every kind of task a
+worker must have been killed, and the driver while one ran. Nodes are processes of one machine, with one core each.
 """
 
 from __future__ import annotations
@@ -29,17 +29,20 @@ from worlds import make_photos
 
 SETTINGS = ["train.budget=1200", "densify.every=20", "language.encoder=none"]
 OF_SCENE = {
-    "row": ["photos.poses=keep", "frame.keep_world=true", "train.block_photos=14", "train.iterations=2000"],
+    "row": ["photos.poses=keep", "frame.keep_world=true", "train.block_photos=230", "train.iterations=2000"],
     "tabletop": ["train.iterations=60"],
 }
-TASKS = ("extract_task", "match_task", "submodel_task", "optimise_block")
-START, EXTRACT, EXTRACTED, MATCH, MATCHED, PLACE, PLACED, BLOCK, DONE = range(9)
+TASKS = ("extract_task", "match_task", "submodel_task", "optimise_block", "vote_task", "silhouette_task")
+START, EXTRACT, EXTRACTED, MATCH, MATCHED, PLACE, PLACED, BLOCK, JOINED, VOTE, GROUPED, SHOW, DONE = range(13)
 """How far a run is: before the first task; while tasks of a kind run; after them, while the driver works alone."""
-WORKER = {"row": [BLOCK] * 3, "tabletop": [EXTRACT, MATCH, PLACE]}
-DRIVER = {"row": [*[BLOCK] * 7, DONE], "tabletop": [EXTRACT, EXTRACT, EXTRACTED, MATCH, MATCH, PLACE, PLACE, PLACED]}
+WORKER = {"row": [*[BLOCK] * 3, VOTE, SHOW], "tabletop": [EXTRACT, MATCH, PLACE]}
+DRIVER = {
+    "row": [*[BLOCK] * 7, VOTE, SHOW, DONE],
+    "tabletop": [EXTRACT, EXTRACT, EXTRACTED, MATCH, MATCH, PLACE, PLACE, PLACED],
+}
 """Where a worker and the driver are killed, in order: there, or where the run is when it is further."""
-MOMENTS, LATER = random.Random(0), 1.5
-"""A kill is later by a random number of seconds, LATER at most."""
+MOMENTS, LATER, SHORTLY = random.Random(0), 1.5, 0.2
+"""A kill is later by a random number of seconds, LATER at most; SHORTLY in votes and silhouettes."""
 QUIET = 0.5
 """Seconds without a task after which the tasks of a kind are over."""
 
@@ -100,7 +103,7 @@ def make(words: list[str], log: Path, who: str, plan: Sequence[int]) -> tuple[in
                     far += 1
                 if len(kills) == len(plan) or far < plan[len(kills)]:
                     continue
-                time.sleep(MOMENTS.uniform(0, LATER))
+                time.sleep(MOMENTS.uniform(0, SHORTLY if far in (VOTE, SHOW) else LATER))
                 pid, task = next(iter(workers().items()), (None, "none"))
                 if process.poll() is None and who == "the driver":
                     process.kill()
@@ -121,7 +124,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         os.environ["RAY_TMPDIR"] = folder  # nothing stays in /tmp/ray, not even the address of a cluster that is gone
         home = Path(folder)
-        scenes = {"row": write_row(home / "row"), "tabletop": write_tabletop(home / "tabletop")}
+        scenes = {"row": write_row(home / "row", photos=384), "tabletop": write_tabletop(home / "tabletop")}
         wanted = {}
         for name, scene in scenes.items():
             subprocess.run(command(name, scene, home / f"{name}.gsmap"), check=True, capture_output=True)
