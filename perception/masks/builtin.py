@@ -127,17 +127,18 @@ def fuse(
     footprints = np.concatenate([(view.depth[::4, ::4] / view.K[0, 0]).ravel() for view in views])
     builders = [SurfaceBuilder(side * float(np.median(footprints)), shift) for shift in shifts]
 
-    def pixels(view: StereoView) -> tuple[np.ndarray, np.ndarray]:
+    def voxels(view: StereoView) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
         photo, depth = view.cues()
         learned = boundaries(photo, depth, layers).astype(np.float16)
         border = 1 / (1 + np.exp(-learned[:2].max(axis=0).astype(np.float32)))
         known = view.confirmed & (depth.step.max(axis=0) < _SMOOTH)
-        return learned, pixels_of(photo, depth, border, known, view.world_from_camera)
+        pixels = pixels_of(photo, depth, border, known, view.world_from_camera)
+        return learned, [builder.voxels_of(pixels) for builder in builders]
 
-    for view, (learned, shown) in zip(views, in_threads(pixels, views), strict=True):
+    for view, (learned, found) in zip(views, in_threads(voxels, views), strict=True):
         view.learned = view.keep(learned)
-        for builder in builders:
-            builder.add(shown)
+        for builder, shown in zip(builders, found, strict=True):
+            builder.add(*shown)
     return [builder.build() for builder in builders]
 
 

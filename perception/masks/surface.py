@@ -47,28 +47,31 @@ class SurfaceBuilder:
     """Accumulates photos one by one. Memory grows with the surface, not with the number of photos.
 
     size: side of the voxels; shift: of their grid along each axis, in sides. Each voxel has sums over its pixels,
-    columns _COUNT to _BORDER.
+    columns _COUNT to _BORDER. Too many voxels are made eight times as large: `halvings` of their indices so far.
     """
 
     def __init__(self, size: float, shift: float = 0.0) -> None:
-        self.size, self.origin = size, shift * size
+        self.size, self.origin, self.halvings = size, shift * size, 0
+        self._first_size = size
         self._keys, self._sums = np.zeros(0, np.int64), np.zeros((0, _BORDER + 1))
 
-    def add(self, pixels: np.ndarray) -> None:
-        """Adds the `pixels_of` a photo."""
-        self._merge(voxel_keys(pixels[:, _POINT] - self.origin, self.size), pixels)
+    def voxels_of(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Keys [N] of the voxels, of the first size, that the `pixels_of` a photo are in, and their sums."""
+        return _summed(voxel_keys(pixels[:, _POINT] - self.origin, self._first_size), pixels)
 
-    def _merge(self, keys: np.ndarray, values: np.ndarray) -> None:
-        """Adds values [P, C] to the sums of voxels keys [P]; too many voxels are made eight times as large."""
+    def add(self, keys: np.ndarray, sums: np.ndarray) -> None:
+        """Adds the `voxels_of` a photo."""
+        for _ in range(self.halvings):
+            keys, sums = _halved(keys, sums)
         every, index = np.unique(np.concatenate([self._keys, keys]), return_inverse=True)
         old, new = np.split(index, [len(self._keys)])
-        total = sums_by(new, values, len(every))
+        total = np.zeros((len(every), sums.shape[1]))
+        total[new] = sums
         total[old] += self._sums
         self._keys, self._sums = every, total
-        if len(every) > 2 * _MOST:
-            self.size *= 2
-            self._keys, self._sums = self._keys[:0], self._sums[:0]
-            self._merge(pack_voxels(unpack_voxels(every) // 2), total)
+        while len(self._keys) > 2 * _MOST:
+            self.size, self.halvings = 2 * self.size, self.halvings + 1
+            self._keys, self._sums = _halved(self._keys, self._sums)
 
     def build(self) -> Surface:
         """The voxels with at least _LEAST_PIXELS pixels."""
@@ -80,6 +83,17 @@ class SurfaceBuilder:
         return Surface(
             self.size, self.origin, self._keys[rows], sums[:, _COUNT], points, normals.astype(np.float32), lab, border
         )
+
+
+def _summed(keys: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The distinct of keys [P], ascending, and the sums of `values` [P, C] by them."""
+    every, index = np.unique(keys, return_inverse=True)
+    return every, sums_by(index, values, len(every))
+
+
+def _halved(keys: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Keys and sums of voxels of twice the side."""
+    return _summed(pack_voxels(unpack_voxels(keys) // 2), sums)
 
 
 def pixels_of(

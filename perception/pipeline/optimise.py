@@ -198,7 +198,7 @@ def label_photos(
         report = compute_masks(
             photos.training,
             source,
-            lambda view: load_photo(view, side),
+            lambda view: by_name[view.name].photo.numpy(),
             run.masks,
             run.progress,
             load_depth=lambda view: depth(by_name[view.name]),
