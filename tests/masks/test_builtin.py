@@ -14,6 +14,7 @@ import pytest
 from perception.errors import InputError
 from perception.geometry import move_points
 from perception.masks import compute_masks, load_labels, make_source
+from perception.masks import surface as surface_module
 from perception.masks.builtin import BuiltinSegmentation, fuse, labels_of, surface_graphs
 from perception.masks.cues import depth_cues
 from perception.masks.merge_features import PAIR_FEATURES, pair_features
@@ -34,7 +35,7 @@ from perception.masks.stereo import (
     measure_depths,
     plane_depths,
 )
-from perception.masks.surface import pack_voxels, unpack_voxels, voxel_keys
+from perception.masks.surface import SurfaceBuilder, pack_voxels, unpack_voxels, voxel_keys
 from perception.masks.surface_graph import CONTACT, DEPTH, PIXELS, VOXELS, SurfaceGraph, neighbours, voxel_edges
 from perception.types import DepthImage, View
 from support.mask_scores import best_ious, leaf_sums
@@ -535,3 +536,26 @@ def test_noise_on_a_bare_wall_is_no_thing():
     labels, probability = divided(graph, tree_by(read_model(), graph), read_model())
     small = np.bincount(labels, minlength=len(probability)) < 0.5 * len(labels)
     assert (probability[small] < 0.5).all()
+
+
+def test_too_many_voxels_are_doubled_until_they_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against a grid that had the last size from the start; photos come before and after it is doubled."""
+    rng = np.random.default_rng(5)
+    photos = [rng.uniform(-1, 1, (400, 11)) * [1, *[1 + n] * 3, *[1] * 7] for n in range(4)]
+    for photo in photos:
+        photo[:, 0] = 1
+    monkeypatch.setattr(surface_module, "_MOST", 60)
+    grown = SurfaceBuilder(0.05, 1 / 3)
+    for photo in photos:
+        grown.add(*grown.voxels_of(photo))
+    monkeypatch.undo()
+    plain = SurfaceBuilder(grown.size)
+    plain.origin = grown.origin
+    for photo in photos:
+        plain.add(*plain.voxels_of(photo))
+    assert grown.size == 0.05 * 2**grown.halvings and grown.halvings >= 3
+    one, other = grown.build(), plain.build()
+    np.testing.assert_array_equal(one.keys, other.keys)
+    np.testing.assert_allclose(one.points, other.points, atol=1e-6)
+    np.testing.assert_array_equal(one.pixels, other.pixels)
+    assert 10 < len(one) <= 120
