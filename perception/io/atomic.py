@@ -15,6 +15,7 @@ import errno
 import fcntl  # not filelock, which leaves lock files behind, cannot lock folders and does not name the holder
 import os
 import shutil
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from glob import escape
@@ -26,6 +27,7 @@ from perception.errors import InputError
 
 _FULL = {errno.ENOSPC, errno.EDQUOT}
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # from Linux fcntl.h and fs.h
+RETRY = 0.001  # seconds
 _TAKEN = {errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR}
 
 Discard = Callable[[Path, Path], None]
@@ -142,17 +144,21 @@ def current(path: Path) -> Path:
 
 @contextmanager
 def _locked(path: Path, make: Callable[[], None]) -> Iterator[None]:
-    """Calls `make` to create `path` and holds a lock on it, if the file system supports locks."""
+    """Calls `make` to create `path` and holds a lock on it, if the file system supports locks. Another writer may take
+    it for one that a killed writer left, and delete it before it is locked; then it is made anew."""
     while True:
         make()
-        descriptor = os.open(path, os.O_RDONLY)
         try:
-            with contextlib.suppress(OSError):
-                lock(descriptor)
+            descriptor = os.open(path, os.O_RDONLY)
+        except FileNotFoundError:
+            continue
+        try:
+            while not _locks(descriptor) and names(path, descriptor):
+                time.sleep(RETRY)  # the other writer has it, and is about to delete it
             if names(path, descriptor):
                 yield
                 return
-        finally:  # if another writer deleted it before it was locked: retry
+        finally:
             os.close(descriptor)
 
 
@@ -240,6 +246,14 @@ def lock(descriptor: int) -> bool:
             return False
         raise
     return True
+
+
+def _locks(descriptor: int) -> bool:
+    """`lock`; True where the file system does not support it."""
+    try:
+        return lock(descriptor)
+    except OSError:
+        return True
 
 
 def names(path: Path, descriptor: int) -> bool:

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ import pytest
 import perception
 from perception.errors import InputError
 from perception.io import atomic
-from perception.io.atomic import atomic_directory, atomic_file, recover
+from perception.io.atomic import atomic_directory, atomic_file, recover, write_file
 from perception.map.files import map_signature
 from perception.map.write import read_map, write_map
 from support.paths import SUPPORT
@@ -88,3 +89,12 @@ def test_between_the_two_renames_readers_read_the_old_map_and_move_nothing(gmap:
     assert len(perception.load_map(gmap).means) == 300 and len(read_map(gmap)) == 300
     assert map_signature(gmap) == before and not gmap.exists()
     aside.rename(gmap)
+
+
+def test_many_writers_of_one_file_are_not_in_each_others_way(tmp_path: Path) -> None:
+    """Blocks of a scene write the label images of the photos that they share. Locks are of descriptors, so threads race
+    as processes do. Each writer has a moment before it holds the lock on its temporary."""
+    file = tmp_path / "label.png"
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda n: write_file(file, bytes([n % 250]) * 5000), range(2000)))
+    assert len(set(file.read_bytes())) == 1 and list(tmp_path.iterdir()) == [file]
