@@ -19,6 +19,8 @@ from perception.errors import InputError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+MOST_THREADS = 8
+"""Photos that are worked on at a time; each takes tens of megabytes, and Python's own steps take turns anyway."""
 _CGROUPS, _OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 threads_before: ContextVar[int] = ContextVar("threads_before", default=0)
 """Threads that torch had outside `torch_on_one_thread`; 0 outside of it."""
@@ -31,8 +33,9 @@ def cores() -> int:
 
 
 def in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-    """work(item) of each item, in order, as many at a time as there are `cores`; no more results wait than that."""
-    most, waiting = cores(), deque[Future[Result]]()
+    """work(item) of each item, in order, as many at a time as there are `cores`, but at most MOST_THREADS; no more
+    results wait than that."""
+    most, waiting = min(cores(), MOST_THREADS), deque[Future[Result]]()
     with ThreadPoolExecutor(most) as pool:
         try:
             for item in items:
