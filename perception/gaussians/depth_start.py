@@ -16,6 +16,7 @@ import torch
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.views import TrainingView, unprojected
 from perception.geometry import sums_by
+from perception.machine import in_threads
 from perception.masks.surface import voxel_keys
 
 SAMPLES = 1_500_000
@@ -146,17 +147,23 @@ def _voxels(
 
 def _consistent(points: np.ndarray, side: float, views: list[TrainingView]) -> np.ndarray:
     """[P] bool: whether at least as many views measured each point as measured something behind it."""
-    seen, through = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
-    for view in views:
+    columns = np.ascontiguousarray(points.T)
+
+    def judged(view: TrainingView) -> tuple[np.ndarray, np.ndarray]:
+        """Points [M] in the image, and whether the view measured each there (1) or something behind it (−1)."""
         assert view.depth is not None
         depth, K, pose = view.depth.numpy(), view.K.double().numpy(), view.camera_from_world.double().numpy()
-        x, y, z = ((points * pose[i, :3]).sum(axis=1) + pose[i, 3] for i in range(3))
+        x, y, z = (columns[0] * a + columns[1] * b + columns[2] * c + t for a, b, c, t in pose[:3].tolist())
         ahead = z > 0
         column, row = (np.floor(K[i, i] * c / np.where(ahead, z, 1) + K[i, 2]) for i, c in ((0, x), (1, y)))
         inside = ahead & (column >= 0) & (row >= 0) & (column < depth.shape[1]) & (row < depth.shape[0])
-        theirs = np.zeros(len(points))
-        theirs[inside] = depth[row[inside].astype(np.int64), column[inside].astype(np.int64)]
-        slack = AGREE * theirs + side / 2
-        seen += (theirs > 0) & (np.abs(theirs - z) <= slack)
-        through += (theirs > 0) & (theirs - z > slack)
+        shown = np.flatnonzero(inside)
+        theirs = depth[row[shown].astype(np.int64), column[shown].astype(np.int64)].astype(np.float64)
+        slack, behind = AGREE * theirs + side / 2, theirs - z[shown]
+        return shown, np.where(theirs > 0, (np.abs(behind) <= slack) * 1 - (behind > slack), 0)
+
+    seen, through = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
+    for shown, sign in in_threads(judged, views):
+        seen[shown] += sign > 0
+        through[shown] += sign < 0
     return seen >= np.maximum(through, 1)
