@@ -210,7 +210,7 @@ def load_checkpoint(path: Path, mark: str) -> dict[str, Any] | None:
 
 INPUTS = "inputs.json"
 """Name of the list of input files in a work folder; every run writes it first."""
-TASKS = ("block-*", "labels-*", "votes-*", "silhouettes-*", "leg-*")
+TASKS = ("block-*", "labels-*", "model-*", "levels-*", "votes-*", "silhouettes-*", "leg-*")
 OWN = ("*.pt", "masks", "sfm", "poses-*", *TASKS, ".*.new-*", ".*.old-*", ".*.lock", INPUTS)
 """Names of all that a run writes in its work folder."""
 LEAST_DISK = 256 << 20

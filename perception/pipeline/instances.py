@@ -20,7 +20,7 @@ from perception.instances.group import Grouping, group
 from perception.instances.levels import without_faint
 from perception.instances.silhouettes import Silhouettes, view_silhouettes
 from perception.instances.texts import read_texts, store_texts
-from perception.instances.votes import joined_votes, view_votes
+from perception.instances.votes import joined_votes, mask_votes
 from perception.language.base import Encoder, reading_of
 from perception.language.description import to_arrays
 from perception.language.ocr import TextReader
@@ -57,10 +57,12 @@ def group_gaussians(optimised: Optimised, run: Run, segments: Segmentation | Non
         return None
     run.progress.log(f"grouping {len(nearby.gaussians)} Gaussians")
     return_free_memory()
-    count, half = len(nearby.gaussians), config.losses.half_resolution
-    here = (view_votes(nearby, view, half) for view in views)
-    found = votes_by_tasks(run, optimised) if by_tasks(run, optimised) else here
-    votes = joined_votes(found, count, len(views), run.progress, run.new_keep())
+    half, keep = config.losses.half_resolution, run.new_keep()
+    if by_tasks(run, optimised):
+        found = votes_by_tasks(run, optimised)
+        votes = joined_votes(found, len(nearby.gaussians), len(views), run.progress, keep)
+    else:
+        votes = mask_votes(nearby, views, half_resolution=half, progress=run.progress, keep=keep)
     gaussians = nearby.gaussians.to("cpu")
     tensors = (gaussians.means, gaussians.scales, gaussians.opacities, gaussians.features)
     means, scales, opacities, features = (tensor.detach().numpy() for tensor in tensors)

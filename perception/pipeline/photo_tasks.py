@@ -23,6 +23,7 @@ from perception.instances.silhouettes import Silhouettes, view_silhouettes
 from perception.instances.votes import ViewVotes, view_votes
 from perception.io.arrays import read_npz
 from perception.io.atomic import atomic_directory
+from perception.pipeline.checkpoint import digest
 from perception.pipeline.optimise import Optimised, Run
 from perception.progress import QUIET, Progress
 from perception.tasks.folder import RESULT, has_task, read_task, run_tasks, write_task
@@ -90,28 +91,27 @@ def _by_tasks(
     run: Run, optimised: Optimised, what: str, task: Callable[..., None], levels: Sequence[np.ndarray] = ()
 ) -> Iterator[Arrays]:
     """What the tasks find of each photo. levels: ids [N] of all Gaussians."""
-    views = optimised.photos.training
+    views, gaussians = optimised.photos.training, optimised.nearby.gaussians.to("cpu")
     parts, shown = optimised.nearby.parts([view.name for view in views])
-    model = _write_model(run, what, optimised.nearby.gaussians.to("cpu"), parts, levels)
-    folders = []
+    tensors = {name: tensor.detach().numpy() for name, tensor in gaussians.named().items()}
+    folders = [_write_parts(run, "model", {**tensors, ROWS: np.arange(len(gaussians))}, parts)]
+    if levels:
+        folders.append(_write_parts(run, "levels", {LEVELS: np.stack(levels, axis=1)}, parts))
+    name, tasks = f"{what}-{digest([folder.name for folder in folders])}", []
     for first in range(0, len(views), PHOTOS_A_TASK):
         some = slice(first, first + PHOTOS_A_TASK)
-        folders.append(model.with_name(f"{model.name}-{first}"))
-        if not has_task(folders[-1]):
+        tasks.append(run.work / f"{name}-{first}")
+        if not has_task(tasks[-1]):
             scene = Scene(views[some], np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-            paths = {"model": str(model.resolve()), "masks": str(run.masks.resolve())}
-            write_task(folders[-1], scene, config=run.config.to_json(), parts=shown[some], **paths)
-    results = run_tasks(run.engine, task, folders, "photo set", run.progress)
+            paths = {"arrays": [str(folder.resolve()) for folder in folders], "masks": str(run.masks.resolve())}
+            write_task(tasks[-1], scene, config=run.config.to_json(), parts=shown[some], **paths)
+    results = run_tasks(run.engine, task, tasks, "photo set", run.progress)
     for file in (file for result in results for file in sorted(result.iterdir())):
         yield read_npz(file, file, f"delete {file.parents[1]} and run again")
 
 
-def _write_model(
-    run: Run, what: str, gaussians: Gaussians, parts: Sequence[np.ndarray], levels: Sequence[np.ndarray]
-) -> Path:
-    """A folder of the work folder with the Gaussians and ids of each part, named by what they are."""
-    arrays = {name: tensor.detach().numpy() for name, tensor in gaussians.named().items()}
-    arrays[LEVELS] = np.stack([np.zeros(len(gaussians), np.int32), *levels], axis=1)[:, 1:]
+def _write_parts(run: Run, what: str, arrays: Arrays, parts: Sequence[np.ndarray]) -> Path:
+    """A folder of the work folder, named by its content, with the rows of each part of `arrays` [N, ...]."""
     content = hashlib.sha256(run.mark.encode())
     for array in [*arrays.values(), *parts]:
         content.update(np.ascontiguousarray(array).tobytes())
@@ -120,7 +120,7 @@ def _write_model(
         with atomic_directory(folder) as new:
             for number, rows in enumerate(parts):
                 chosen = {name: array[rows] for name, array in arrays.items()}
-                np.savez(new / f"{number}.npz", **{ROWS: rows}, **chosen)  # type: ignore[arg-type]
+                np.savez(new / f"{number}.npz", **chosen)  # type: ignore[arg-type]
     return folder
 
 
@@ -131,17 +131,21 @@ def _of_photos(
     scene, facts = read_task(folder)
     if (folder / RESULT).is_dir():
         return
-    config, model = MapConfig.model_validate(facts["config"]), Path(facts["model"])
-    device, needed = choose_device(config.device)[0], sorted(set().union(*facts["parts"]))
-    files = [model / f"{number}.npz" for number in needed]
-    stored = [read_npz(file, file, f"delete {model} and run again") for file in files]
-    whole = {name: np.concatenate([part[name] for part in stored]) for name in stored[0]}
-    beside = {name: whole.pop(name) for name in (ROWS, LEVELS)}
-    sizes = [len(part[ROWS]) for part in stored]
-    del stored
-    own = dict(zip(needed, np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1]), strict=True))
+    config, needed = MapConfig.model_validate(facts["config"]), sorted(set().union(*facts["parts"]))
+
+    def stored(number: int) -> Arrays:
+        files = [Path(held) / f"{number}.npz" for held in facts["arrays"]]
+        return {k: v for file in files for k, v in read_npz(file, file, f"delete {file.parent} and run again").items()}
+
+    each = [stored(number) for number in needed]
+    whole = {name: np.concatenate([part[name] for part in each]) for name in each[0]}
+    ends = np.cumsum([len(part[ROWS]) for part in each])
+    del each
+    beside = {name: whole.pop(name) for name in (ROWS, LEVELS) if name in whole}
+    own = dict(zip(needed, np.split(np.arange(ends[-1]), ends[:-1]), strict=True))
     sets: dict[tuple[int, ...], list[np.ndarray]] = {}
     shown = [sets.setdefault(tuple(numbers), [own[n] for n in numbers]) for numbers in facts["parts"]]
+    device = choose_device(config.device)[0]
     gaussians = Gaussians(**{name: torch.from_numpy(array) for name, array in whole.items()}).to(device)
     nearby = Nearby(gaussians, dict(zip([view.name for view in scene.views], shown, strict=True)))
     with atomic_directory(folder / RESULT) as new:
