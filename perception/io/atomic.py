@@ -27,7 +27,7 @@ from perception.errors import InputError
 
 _FULL = {errno.ENOSPC, errno.EDQUOT}
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # from Linux fcntl.h and fs.h
-RETRY = 0.001  # seconds
+RETRY, TRIES = 0.001, 10_000  # seconds between two tries to lock what is written, and their number
 _TAKEN = {errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR}
 
 Discard = Callable[[Path, Path], None]
@@ -153,7 +153,9 @@ def _locked(path: Path, make: Callable[[], None]) -> Iterator[None]:
         except FileNotFoundError:
             continue
         try:
-            while not _locks(descriptor) and names(path, descriptor):
+            for _ in range(TRIES):
+                if _locks(descriptor) or not names(path, descriptor):
+                    break
                 time.sleep(RETRY)  # the other writer has it, and is about to delete it
             if names(path, descriptor):
                 yield
