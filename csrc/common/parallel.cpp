@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <atomic>
+#include <chrono>
 #include <condition_variable>
 #include <exception>
 #include <memory>
@@ -34,33 +35,61 @@ struct Job {
   }
 };
 
+// Jobs follow each other within microseconds, where waking a thread takes some tens.
+constexpr std::chrono::microseconds kSpin{30};
+
+// Waits until `ready`, at most for kSpin.
+template <class Ready>
+bool spin(Ready &&ready) {
+  const auto end = std::chrono::steady_clock::now() + kSpin;
+  do {
+    for (int i = 0; i < 16; ++i) {
+      if (ready()) return true;
+#if defined(__x86_64__)
+      __builtin_ia32_pause();
+#elif defined(__aarch64__)
+      asm volatile("yield");
+#endif
+    }
+  } while (std::chrono::steady_clock::now() < end);
+  return false;
+}
+
 class Pool {
  public:
   void run(Job &job, int helpers) {
-    std::unique_lock<std::mutex> lock(mutex_);
-    try {
-      for (; started_ < helpers; ++started_) std::thread(&Pool::loop, this, started_ + 1).detach();
-    } catch (const std::system_error &) {  // a thread that the system will not start is done without
-      helpers = started_;
+    {
+      std::lock_guard<std::mutex> lock(mutex_);
+      try {
+        for (; started_ < helpers; ++started_) std::thread(&Pool::loop, this, started_ + 1).detach();
+      } catch (const std::system_error &) {  // a thread that the system will not start is done without
+        helpers = started_;
+      }
+      job_ = &job;
+      wanted_ = helpers;
+      running_ = helpers;
+      ++generation_;
+      if (asleep_ > 0) wake_.notify_all();
     }
-    job_ = &job;
-    wanted_ = running_ = helpers;
-    ++generation_;
-    wake_.notify_all();
-    lock.unlock();
     job.work(0);
-    lock.lock();
+    if (spin([this] { return running_ == 0; })) return;
+    std::unique_lock<std::mutex> lock(mutex_);
     done_.wait(lock, [this] { return running_ == 0; });
-    job_ = nullptr;
   }
 
   std::atomic<bool> busy{false};  // one job at a time; a second caller, or a task that asks for tasks, runs alone
 
  private:
   void loop(int worker) {
-    std::unique_lock<std::mutex> lock(mutex_);
     for (unsigned long seen = 0;;) {
-      wake_.wait(lock, [&] { return generation_ != seen && job_; });
+      const auto called = [&] { return generation_ != seen; };
+      const bool at_once = spin(called);
+      std::unique_lock<std::mutex> lock(mutex_);
+      if (!at_once) {
+        ++asleep_;
+        wake_.wait(lock, called);
+        --asleep_;
+      }
       seen = generation_;
       if (worker > wanted_) continue;
       Job *job = job_;
@@ -73,9 +102,10 @@ class Pool {
 
   std::mutex mutex_;
   std::condition_variable wake_, done_;
-  Job *job_ = nullptr;
-  int started_ = 0, wanted_ = 0, running_ = 0;
-  unsigned long generation_ = 0;
+  Job *job_ = nullptr;  // of a past generation, all its helpers are done and none reads it
+  int started_ = 0, wanted_ = 0, asleep_ = 0;
+  std::atomic<int> running_{0};
+  std::atomic<unsigned long> generation_{0};
 };
 
 // Threads do not survive a fork: the child starts a pool of its own. Never destroyed: its threads outlive main.

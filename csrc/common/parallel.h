@@ -1,4 +1,4 @@
-// The one pool of threads. They sleep while there is nothing to do (no spinning: other work shares the machine).
+// The one pool of threads. They wait some microseconds for the next job and then sleep: other work shares the machine.
 // Tasks may run on any worker in any order, so nothing that is computed may depend on either: a task writes only what
 // is its own, and sums over tasks are taken afterwards in the order of the tasks.
 #pragma once

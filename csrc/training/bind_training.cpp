@@ -159,6 +159,14 @@ void scale(In<T, 1> values, double factor, Out<T, 1> out, int threads) {
 }
 
 template <class T>
+void activate(In<T, 1> values, bool logistic, Out<T, 1> out, int threads, const std::string &level) {
+  require_aligned("values", values, "out", out);
+  require(same_shape(values, out), "out: expected the shape of values");
+  nb::gil_scoped_release release;
+  pt::activate(values.data(), static_cast<int64_t>(values.size()), logistic, out.data(), {threads, parse_level(level)});
+}
+
+template <class T>
 int64_t adam(Out<T, 2> param, In<T, 2> grad, Out<T, 2> first, Out<T, 2> second, std::optional<In<uint8_t, 1>> visible,
           In<double, 1> rate, int64_t step, double beta1, double beta2, double eps, int threads,
           const std::string &level) {
@@ -190,6 +198,8 @@ void bind_precision(nb::module_ &m) {
         "threads"_a = 0, "level"_a = "auto", "out = pull[slot] (F - means[slot]) + push[slot].");
   m.def("sum", &sum<T>, arg("values"), "squared"_a, "threads"_a = 0, "level"_a = "auto");
   m.def("scale", &scale<T>, arg("values"), "factor"_a, arg("out"), "threads"_a = 0, "out = factor * values.");
+  m.def("activate", &activate<T>, arg("values"), "logistic"_a, arg("out"), "threads"_a = 0, "level"_a = "auto",
+        "out = exp(values), or 1 / (1 + exp(-values)), where values beyond +-80 count as those.");
   m.def("adam", &adam<T>, arg("param"), arg("grad"), arg("first"), arg("second"), arg("visible").none(), arg("rate"),
         "step"_a, "beta1"_a, "beta2"_a, "eps"_a, "threads"_a = 0, "level"_a = "auto",
         "One Adam step in place on the visible rows; the number of rows skipped for a non-finite gradient.");

@@ -32,6 +32,14 @@ void scale(const T *values, int64_t n, double factor, T *out, const Execution &e
   });
 }
 
+template <class T>
+void activate(const T *values, int64_t n, bool logistic, T *out, const Execution &execution) {
+  const auto &table = kernels<T>(execution.level);
+  const auto run = logistic ? table.logistics : table.exponentials;
+  parallel_pieces(resolve_threads(execution.threads), Pieces(n, 32768),
+                  [&](int64_t begin, int64_t end) { run(values + begin, end - begin, out + begin); });
+}
+
 void add_statistics(const StatisticsArguments &a, int threads) {
   parallel_pieces(resolve_threads(threads), Pieces(a.rows), [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
@@ -44,6 +52,8 @@ void add_statistics(const StatisticsArguments &a, int threads) {
 
 template void scale(const float *, int64_t, double, float *, const Execution &);
 template void scale(const double *, int64_t, double, double *, const Execution &);
+template void activate(const float *, int64_t, bool, float *, const Execution &);
+template void activate(const double *, int64_t, bool, double *, const Execution &);
 template double sum(const float *, int64_t, bool, const Execution &);
 template double sum(const double *, int64_t, bool, const Execution &);
 

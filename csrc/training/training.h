@@ -82,6 +82,10 @@ double sum(const T *values, int64_t n, bool squared, const Execution &);
 template <class T>
 void scale(const T *values, int64_t n, double factor, T *out, const Execution &);
 
+// out = exp(values), or 1 / (1 + exp(-values)), where values beyond +-80 count as those.
+template <class T>
+void activate(const T *values, int64_t n, bool logistic, T *out, const Execution &);
+
 template <class T>
 struct AdamArguments {
   T *param, *first, *second;  // [rows, width], in place

@@ -67,6 +67,15 @@ def scale(values: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C
     """out = factor * values."""
 
 @overload
+def activate(values: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], logistic: bool, out: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], threads: int = 0, level: str = 'auto') -> None: ...
+
+@overload
+def activate(values: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu', writable=False)], logistic: bool, out: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu')], threads: int = 0, level: str = 'auto') -> None:
+    """
+    out = exp(values), or 1 / (1 + exp(-values)), where values beyond +-80 count as those.
+    """
+
+@overload
 def adam(param: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu')], grad: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu', writable=False)], first: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu')], second: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu')], visible: Annotated[NDArray[numpy.uint8], dict(shape=(None,), order='C', device='cpu', writable=False)] | None, rate: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu', writable=False)], step: int, beta1: float, beta2: float, eps: float, threads: int = 0, level: str = 'auto') -> int: ...
 
 @overload

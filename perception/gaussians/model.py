@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,20 +11,36 @@ import numpy as np
 import torch
 
 from perception.colors import rgb_from_sh, sh_from_rgb
+from perception.gaussians.device import training_kernels
 from perception.geometry import nearest
+from perception.machine import Item, Result, in_threads, torch_on_one_thread
 from perception.map.map import Map
 from perception.rasterizer.types import Inputs
 
 
-def sigmoid(logits: torch.Tensor) -> torch.Tensor:
-    """Sigmoid 1 / (1 + exp(−x)) of each element; the result does not depend on the number of threads, bit for bit.
+def exponential(values: torch.Tensor) -> torch.Tensor:
+    """exp(x) of each element; the result does not depend on the number of threads, bit for bit.
 
-    torch.sigmoid depends on it above 32,768 elements: the last elements of each thread's part take another code path.
+    torch's depend on it above 32,768 elements: the last elements of each thread's part take another code path.
+    """
+    return values.exp() if values.device.type != "cpu" else _activated(values, logistic=False)
+
+
+def sigmoid(logits: torch.Tensor) -> torch.Tensor:
+    """Sigmoid 1 / (1 + exp(−x)) of each element, with the bits that `exponential` promises.
+
     Logits are clamped to ±80, where float32 still holds exp(x). Opacities near 1e-35 need no gradient.
     """
     if logits.device.type != "cpu":
         return torch.sigmoid(logits.clamp(-80, 80))  # two launches, not six
-    return 1 / (1 + torch.exp(-logits.clamp(-80, 80)))
+    return _activated(logits, logistic=True)
+
+
+def _activated(values: torch.Tensor, logistic: bool) -> torch.Tensor:
+    values = values.detach().contiguous()
+    out = torch.empty_like(values)
+    training_kernels(values.device).activate(values.view(-1), logistic, out.view(-1))
+    return out
 
 
 STORED = {
@@ -66,7 +82,7 @@ class Gaussians:
 
     def rows(self, index: torch.Tensor) -> Gaussians:
         """Copies of the rows `index` [M] int64 selects, in its order."""
-        return Gaussians(**{name: tensor[index].clone() for name, tensor in self.named().items()})
+        return Gaussians(**{name: tensor.index_select(0, index) for name, tensor in self.named().items()})
 
     @staticmethod
     def concatenate(parts: list[Gaussians]) -> Gaussians:
@@ -75,7 +91,7 @@ class Gaussians:
 
     @property
     def scales(self) -> torch.Tensor:
-        return self.log_scales.exp()
+        return exponential(self.log_scales)
 
     @property
     def opacities(self) -> torch.Tensor:
@@ -202,12 +218,22 @@ class Nearby:
 
     def of(self, photo: str) -> tuple[Gaussians, np.ndarray]:
         """The Gaussians near a photo, and their rows in the model."""
-        parts = self._rows.get(photo, self._all)
-        if parts is not self._last[0]:
+        parts, found = self._rows.get(photo, self._all), self._last
+        if parts is not found[0]:
             rows = np.concatenate(parts)
             chosen = torch.from_numpy(rows).to(self.gaussians.means.device)
-            self._last = parts, self.gaussians if parts is self._all else self.gaussians.rows(chosen), rows
-        return self._last[1:]
+            found = parts, self.gaussians if parts is self._all else self.gaussians.rows(chosen), rows
+            self._last = found
+        return found[1:]
+
+    def each(self, work: Callable[[Item], Result], views: Iterable[Item]) -> Iterator[Result]:
+        """work(view) of each view, in order, which renders this model. On the CPU each core works on one view at a
+        time, with the same results; of a scene trained in blocks that would be as many copies of parts of the model."""
+        if self._rows or self.gaussians.means.device.type != "cpu":
+            yield from map(work, views)
+            return
+        with torch_on_one_thread():
+            yield from in_threads(work, views)
 
     def parts(self, photos: Sequence[str]) -> tuple[list[np.ndarray], list[list[int]]]:
         """The rows of each part of the model that one of the photos may show, and of each photo the parts' numbers."""

@@ -65,9 +65,10 @@ class SparseAdam:
 
     def keep(self, index: Tensor) -> None:
         """Keeps the rows `index` selects, in its order: [N] bool, or int64 row numbers (repeats allowed)."""
+        rows = index.nonzero()[:, 0] if index.dtype == torch.bool else index
         for table in (self.params, self._first, self._second):
             for name, tensor in table.items():
-                table[name] = tensor[index].contiguous()
+                table[name] = tensor.index_select(0, rows)
 
     def resize(self, name: str, count: int) -> None:
         """Cuts the rows of `name`, [N, K, ...], to K = count, or extends them by zeros, and their moments alike."""

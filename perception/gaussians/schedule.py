@@ -4,7 +4,7 @@ progress   0 ─ .05 ───── .3 ─ .4 ─── .6 ──────�
 photos     half size          │ full size (small photos: from .15)
 features                 │      rendered every 3rd step (`losses.start`, `losses.every`)
 growth         densified every 100 steps, holes filled
-veils          of few photos: removed every 100 steps (see `free_space`)
+veils          of few photos: removed every 100 steps, of more every second epoch (see `free_space`)
 harmonics                            one more degree per trial, then unneeded degrees are removed
 rates                                              decrease to a twentieth
 
@@ -108,7 +108,8 @@ def after_step(state: TrainingState, progress: float, may_stop: bool) -> None:
     due = state.iteration % every == 0
     if due:
         _densify_and_judge(state, progress)
-        _clear_cameras(state)
+        if state.iteration // every % max(1, -(-2 * len(state.views) // every)) == 0:
+            _clear_cameras(state)
     if state.iteration % (5 * every) == 0 and state.progress < 1.0:
         _add_to_curve(state, progress)
     if progress < STOP <= state.progress and state.has_labels and not state.held:  # an update adds in its own way

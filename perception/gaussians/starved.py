@@ -8,12 +8,14 @@ another photo shows their points inside one mask of about that size. Training th
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
 
 from perception.gaussians.model import Gaussians, isotropic
 from perception.gaussians.views import TrainingView, surface_depth, unprojected
+from perception.machine import in_threads
 
 LEAST_PIXELS = 60  # of a mask; smaller ones are noise of the segmentation as often as things
 OWN, WANTED = 16, 24  # Gaussians: a segment of the grouping has 16
@@ -58,7 +60,9 @@ class _Seen:
 def for_starved_masks(gaussians: Gaussians, views: list[TrainingView], seed: int) -> Gaussians:
     """The Gaussians to add; at most MOST of the N given."""
     like = gaussians.to(torch.device("cpu"))
-    seen = [_seen(like, view) for view in views if view.labels is not None and bool((view.labels > 0).any())]
+    labelled = [view for view in views if view.labels is not None and bool((view.labels > 0).any())]
+    means, widest = like.means.double().numpy(), like.log_scales.amax(dim=1).exp().numpy()
+    seen = list(in_threads(partial(_seen, like, means, widest, like.opacities.numpy() >= SOLID), labelled))
     lacking = [np.flatnonzero((one.area >= LEAST_PIXELS) & (one.own < OWN)).tolist() for one in seen]
     starved = [(k, mask) for k, masks in enumerate(lacking) for mask in masks]
     starved.sort(key=lambda km: (-seen[km[0]].area[km[1]], km))
@@ -80,7 +84,8 @@ def for_starved_masks(gaussians: Gaussians, views: list[TrainingView], seed: int
     return _made(like, seen, placed, points, seed)
 
 
-def _seen(gaussians: Gaussians, view: TrainingView) -> _Seen:
+def _seen(gaussians: Gaussians, means: np.ndarray, widest: np.ndarray, solid: np.ndarray, view: TrainingView) -> _Seen:
+    """means [N, 3], widest [N], the largest scales, and solid [N], whether each counts, are of all Gaussians."""
     assert view.labels is not None  # checked by the caller
     labels = view.labels.numpy()
     depth = surface_depth(gaussians, replace(view, depth=None))
@@ -88,9 +93,8 @@ def _seen(gaussians: Gaussians, view: TrainingView) -> _Seen:
     area[0] = 0
     K, pose = view.K.double().numpy(), view.camera_from_world.double().numpy()
     one = _Seen(view, labels, depth, area, np.zeros(len(area), np.int64), K, pose)
-    label, z = one.shown(gaussians.means.double().numpy())
-    size = gaussians.log_scales.amax(dim=1).exp().numpy() * float(view.K[0, 0]) / np.maximum(z, 1e-6)
-    fits = (size <= WITHIN * np.sqrt(area[label] / np.pi)) & (gaussians.opacities.numpy() >= SOLID)
+    label, z = one.shown(means)
+    fits = solid & (widest * float(view.K[0, 0]) / np.maximum(z, 1e-6) <= WITHIN * np.sqrt(area[label] / np.pi))
     return replace(one, own=np.bincount(label[fits], minlength=len(area)))
 
 

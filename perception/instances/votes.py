@@ -48,7 +48,7 @@ def mask_votes(
 ) -> MaskVotes:
     """The votes of all masks of all views, by `view_votes`. keep: where the weights are kept, which grow with photos ×
     visible Gaussians."""
-    found = (view_votes(nearby, view, half_resolution) for view in views)
+    found = nearby.each(lambda view: view_votes(nearby, view, half_resolution), views)
     return joined_votes(found, len(nearby.gaussians), len(views), progress, keep)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from copy import copy
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -132,8 +133,9 @@ def describe(
 def _silhouettes(optimised: Optimised, levels: list[np.ndarray], run: Run) -> list[list[Silhouettes]]:
     """Of each level, the silhouettes of all views."""
     seen, views = [], optimised.photos.views
-    here = (view_silhouettes(optimised.nearby, levels, view) for view in views)
-    for of_view in silhouettes_by_tasks(run, optimised, levels) if by_tasks(run, optimised) else here:
+    here = partial(view_silhouettes, optimised.nearby, levels)
+    tasks = by_tasks(run, optimised)
+    for of_view in silhouettes_by_tasks(run, optimised, levels) if tasks else optimised.nearby.each(here, views):
         seen.append(of_view)
         run.progress.update("silhouettes", len(seen), len(views))
     _core.rasterizer_release_memory()  # hundreds of MiB, next to which the encoder's activations would lie

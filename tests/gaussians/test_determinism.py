@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 import torch
 
+from perception._core.training import activate
 from perception.cli import main
 from perception.config import load_config
-from perception.gaussians.model import sigmoid
+from perception.gaussians.model import exponential, sigmoid
 from perception.io.cloud import read_cloud, write_cloud
 from perception.map.write import read_map
 from perception.pipeline.mapping import build_map
+from perception.rasterizer.cpu import simd_levels
 from perception.types import PointCloud
 
 PAIRS = ["train.iterations=100", "train.budget=3000", "densify.every=10", "photos.holdout=6"]
@@ -93,22 +95,27 @@ def test_so_is_one_of_more_gaussians_than_torch_gives_one_thread(small_scene: Pa
         assert (tmp_path / "1.gsmap" / name).read_bytes() == (tmp_path / "2.gsmap" / name).read_bytes(), name
 
 
-def test_opacities_have_the_same_bits_whoever_computes_them(threads) -> None:
-    """torch.sigmoid fails at about half of these sizes."""
-    generator = torch.Generator().manual_seed(0)
-    for size in range(2**15 + 1, 2**15 + 25):
-        logits = 6 * torch.randn(size, generator=generator)
-        images = []
-        for number in (1, 2, 3):
-            threads(number)
-            leaf = logits.clone().requires_grad_()
-            sigmoid(leaf).sum().backward()
-            images.append((sigmoid(logits), leaf.grad))
-        assert all(torch.equal(a, b) for other in images[1:] for a, b in zip(images[0], other, strict=True)), size
-    exact = torch.sigmoid(logits.double())
-    torch.testing.assert_close(images[0][0].double(), exact, rtol=8 * U, atol=0)  # exp within 4 U, a sum, a quotient
-    slope = exact * torch.sigmoid(-logits.double())  # 1 − exact would cancel
-    torch.testing.assert_close(images[0][1].double(), slope, rtol=16 * U, atol=0)  # thrice those roundings
-    far = torch.tensor([-1e30, -100.0, 100.0, 1e30], requires_grad=True)
-    sigmoid(far).sum().backward()
-    assert torch.equal(far.grad, torch.zeros(4)) and sigmoid(far).tolist()[2:] == [1, 1]
+@pytest.mark.parametrize("level", simd_levels())
+def test_activations_have_the_same_bits_with_any_threads_and_are_those_of_float64(level) -> None:
+    """torch's fail at about half of these sizes."""
+    random = np.random.default_rng(0)
+    for size in [*range(2**15 + 1, 2**15 + 25), 3 * 2**16 + 5]:
+        values = (12 * random.standard_normal(size)).clip(-87, 87).astype(np.float32)
+        exact = np.exp(values.astype(np.float64))
+        for logistic, wanted in ((False, exact), (True, 1 / (1 + np.exp(-values.astype(np.float64).clip(-80, 80))))):
+            found = np.empty((3, size), np.float32)
+            for threads in (1, 2, 3):
+                activate(values, logistic, found[threads - 1], threads=threads, level=level)
+            assert np.array_equal(found[0], found[1]) and np.array_equal(found[0], found[2]), size
+            np.testing.assert_allclose(found[0], wanted, rtol=8 * U)  # exp within 4 U, a sum, a quotient
+
+
+def test_activations_of_what_no_scale_should_be() -> None:
+    far = torch.tensor([-torch.inf, -1e30, -100.0, 88.5, 1e30, torch.inf, torch.nan])
+    scales, opacities = exponential(far), sigmoid(far)
+    assert scales[3:6].isinf().all() and (scales[:3] >= 0).all() and (scales[:3] < 1e-37).all()
+    faintest = torch.full((3,), np.exp(-80.0), dtype=torch.float64)
+    torch.testing.assert_close(opacities[:3].double(), faintest, rtol=1e-6, atol=0)
+    assert opacities[3:6].tolist() == [1, 1, 1] and scales[6].isnan() and opacities[6].isnan()
+    double = torch.linspace(-700, 700, 1001, dtype=torch.float64)
+    torch.testing.assert_close(exponential(double), torch.exp(double), rtol=1e-15, atol=0)

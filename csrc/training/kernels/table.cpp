@@ -2,6 +2,7 @@
 #include "table.h"
 
 #include "adam.h"
+#include "exponential.h"
 #include "instance.h"
 #include "photometric.h"
 #include "vector.h"
@@ -9,8 +10,8 @@
 namespace perception::training::PERCEPTION_LEVEL {
 
 template <class T>
-constexpr Kernels<T> kTable = {photometric_tile<T>, absolute_row<T>,  accumulate<T>, spread<T>,
-                               sum_row<T, false>,   sum_row<T, true>, adam<T>};
+constexpr Kernels<T> kTable = {photometric_tile<T>, absolute_row<T>,  accumulate<T>,    spread<T>, exponentials<T>,
+                               logistics<T>,        sum_row<T, false>, sum_row<T, true>, adam<T>};
 
 extern const Kernels<float> float_kernels;
 const Kernels<float> float_kernels = kTable<float>;

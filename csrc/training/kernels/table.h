@@ -58,6 +58,8 @@ struct Kernels {
   // out = pull[slot] (f - mean[slot]) + push[slot], 0 where slot < 0.
   void (*spread)(const T *features, const int32_t *slots, const double *mean, const double *pull, const double *push,
                  int64_t begin, int64_t end, int64_t width, T *out);
+  void (*exponentials)(const T *values, int64_t n, T *out);
+  void (*logistics)(const T *values, int64_t n, T *out);
   double (*sum)(const T *values, int64_t n);
   double (*sum_squares)(const T *values, int64_t n);
   // Returns the number of rows skipped for a gradient that is not finite.
