@@ -97,10 +97,7 @@ def build_features(
                 tasks.extract(database, photos, masks, as_stored)
             extracted = time.perf_counter()
             chosen = [(names[i], names[j]) for i, j in pairs.select_pairs(database, names, most, progress)]
-            if local:
-                features.match(database, chosen, seed, progress)
-            else:
-                tasks.match(database, chosen, seed)
+            tasks.match(database, chosen, seed)
             seconds = {"features": extracted - started, "matching": time.perf_counter() - extracted}
             possible = len(names) * (len(names) - 1) // 2
             made = {"names": names, "pairs_matched": len(chosen), "pairs_possible": possible, "seconds": seconds}

@@ -1,4 +1,4 @@
-"""Features and matches made by tasks on other machines: the same database as `features.extract` and `match` make here.
+"""Features and matches made by tasks: the same database as `features.extract` and `match` make.
 
 A task has a folder with a part of the photos or pairs, and leaves a COLMAP database there, whose rows are copied.
 """
@@ -13,16 +13,19 @@ from pathlib import Path
 from typing import Any
 
 from perception.io.atomic import atomic_directory
+from perception.machine import cores
 from perception.photos.ignore_masks import stage_masks
 from perception.photos.lens import load_pycolmap
 from perception.progress import QUIET, Progress
 from perception.sfm.features import extract, import_photos, match
 from perception.sfm.staging import stage_photos
-from perception.tasks.engine import Engine
+from perception.tasks.engine import Engine, run_in_processes
 from perception.tasks.folder import RESULT, has_task, read_facts, run_tasks, write_task
 
 PHOTOS_A_TASK, PAIRS_A_TASK = 64, 2000
 """About half a minute on two cores each."""
+LEAST_PAIRS = 200
+"""Of a task on this machine; to start it takes as long as 60 pairs."""
 DATABASE = "database.db"
 _IMAGES = ("rigs", "rig_sensors", "cameras", "frames", "frame_data", "images")
 _FEATURES, _MATCHES = ("keypoints", "descriptors"), ("matches", "two_view_geometries")
@@ -65,18 +68,30 @@ class FeatureTasks:
                             _insert(own, table, (own_id[image], *row))
 
     def match(self, database: Path, chosen: Sequence[tuple[str, str]], seed: int) -> None:
-        """Adds the matches of the chosen pairs to a database with features."""
-        folders = []
-        for first in range(0, len(chosen), PAIRS_A_TASK):
-            some = chosen[first : first + PAIRS_A_TASK]
-            folders.append(self.folder / f"pairs-{first}")
-            if not has_task(folders[-1]):
+        """Adds the matches of the chosen pairs to a database with features; here by a process for each core."""
+        here, folders, size = self.engine.kind == "local", [], PAIRS_A_TASK
+        if here:
+            rounds = -(-len(chosen) // (PAIRS_A_TASK * cores()))
+            size = max(LEAST_PAIRS, -(-len(chosen) // max(1, rounds * cores())))
+            if size >= len(chosen):
+                match(database, chosen, seed, self.progress)
+                return
+        for first in range(0, len(chosen), size):
+            some = chosen[first : first + size]
+            folders.append(self.folder / f"pairs-{first}-{size}")
+            if here or not has_task(folders[-1]):  # an interrupted run's database is gone
                 folders[-1].mkdir(parents=True, exist_ok=True)
                 with closing(sqlite3.connect(database)) as tables:
                     ids = _images(tables)
-                write_part(database, [ids[name] for pair in some for name in pair], folders[-1] / DATABASE)
-                write_task(folders[-1], pairs=some, seed=seed)
-        results = run_tasks(self.engine, match_task, folders, "pair set", self.progress)
+                if not here:
+                    write_part(database, [ids[name] for pair in some for name in pair], folders[-1] / DATABASE)
+                write_task(folders[-1], pairs=some, seed=seed, database=str(database.resolve()) if here else None)
+        if here:
+            paths = [str(folder.resolve()) for folder in folders]
+            run_in_processes(match_task, paths, "poses: matching", self.progress)
+            results = [folder / RESULT for folder in folders]
+        else:
+            results = run_tasks(self.engine, match_task, folders, "pair set", self.progress)
         with closing(sqlite3.connect(database)) as own, own:
             for result in results:
                 with closing(sqlite3.connect(result / DATABASE)) as theirs:
@@ -105,7 +120,8 @@ def match_task(task: str, progress: Progress = QUIET) -> None:
     if (folder / RESULT).is_dir():
         return
     with atomic_directory(folder / RESULT) as new:
-        with closing(sqlite3.connect(folder / DATABASE)) as given, closing(sqlite3.connect(new / DATABASE)) as copy:
+        source = facts["database"] or folder / DATABASE
+        with closing(sqlite3.connect(source)) as given, closing(sqlite3.connect(new / DATABASE)) as copy:
             given.backup(copy)
         match(new / DATABASE, facts["pairs"], facts["seed"], progress)
 

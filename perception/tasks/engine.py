@@ -1,10 +1,11 @@
-"""Where independent tasks run: one after the other in this process, or on the machines of a Ray cluster."""
+"""Where independent tasks run: on this machine, or on those of a Ray cluster."""
 
 from __future__ import annotations
 
 import logging
 import os
 import socket
+import subprocess
 import sys
 import threading
 from collections.abc import Callable, Sequence
@@ -22,6 +23,15 @@ CONNECT = 10.0
 """Seconds in which a cluster must answer."""
 RETRIES = 5
 """How often a task is run again whose worker was lost."""
+_CHILD = """import sys
+sys.path[:] = sys.argv[4:]
+from importlib import import_module
+from perception.errors import InputError
+try:
+    getattr(import_module(sys.argv[1]), sys.argv[2])(sys.argv[3])
+except InputError as error:
+    sys.exit(str(error))
+"""
 
 
 def _join(ray: Any, address: str | None) -> None:
@@ -129,6 +139,33 @@ class _Stoppable(Progress):
     def update(self, stage: str, done: int, total: int, *words: str) -> None:
         if self.stop.is_set():
             raise KeyboardInterrupt
+
+
+def run_in_processes(task: Callable[[str], Any], items: Sequence[str], what: str, progress: Progress) -> None:
+    """task(item) of each item, as many at a time as there are cores, each in a process of its own: for libraries that
+    threads may not share. The first error is raised and ends the others. task: a function that its module has."""
+    command = [sys.executable, "-c", _CHILD, task.__module__, task.__name__]
+    running: list[subprocess.Popen[str]] = []
+
+    def run(item: str) -> None:
+        child = subprocess.Popen([*command, item, *sys.path], stderr=subprocess.PIPE, text=True, start_new_session=True)
+        running.append(child)
+        said = child.communicate()[1].strip()
+        if "Traceback" in said:
+            raise RuntimeError(said)
+        if child.returncode:
+            raise InputError(said or f"{what}: a process ended with code {child.returncode}; is memory short?")
+
+    with ThreadPoolExecutor(cores()) as pool:
+        submitted = [pool.submit(run, item) for item in items]
+        try:
+            for done, one in enumerate(as_completed(submitted), start=1):
+                one.result()
+                progress.update(what, done, len(items))
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for child in running:
+                child.kill()
 
 
 def _on_cores(task: Callable[..., Any], items: Sequence[str], what: str, progress: Progress) -> list[Any]:

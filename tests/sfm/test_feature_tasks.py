@@ -1,4 +1,4 @@
-"""Features and matches made by tasks on other machines: the database is that of one process, bit for bit."""
+"""Features and matches made by tasks, here or on other machines: the database is that of one process, bit for bit."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ import pytest
 
 pytest.importorskip("pycolmap")
 from perception.errors import InputError
+from perception.progress import QUIET
 from perception.sfm import feature_tasks
 from perception.sfm.database import build_features
 from perception.sfm.options import ReadOptions
-from perception.tasks.folder import TASK
+from perception.tasks import engine as engines
+from perception.tasks.folder import TASK, write_task
 from support.elsewhere import Elsewhere
 
 TABLES = ("cameras", "images", "keypoints", "descriptors", "matches", "two_view_geometries")
@@ -63,6 +65,23 @@ def test_the_database_is_that_of_one_process(
 
 
 @pytest.mark.slow
+def test_so_is_that_of_a_process_for_each_core(
+    photos: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(feature_tasks, "LEAST_PAIRS", 20)
+    lenses, wanted, asked = [None] * len(photos), None, []
+    run = feature_tasks.run_in_processes
+    monkeypatch.setattr(feature_tasks, "run_in_processes", lambda *a: (asked.append(len(a[1])), run(*a)))
+    for number in (1, 3):
+        monkeypatch.setattr(feature_tasks, "cores", lambda number=number: number)
+        store = build_features(photos, lenses, ReadOptions(tmp_path / str(number), 3))
+        wanted = wanted or rows(store.database)
+        assert rows(store.database) == wanted and len(wanted["matches"]) > 40
+        assert [path.name for path in (tmp_path / str(number)).iterdir()] == [store.folder.name]
+    assert asked == [3]
+
+
+@pytest.mark.slow
 def test_an_interrupted_run_makes_no_task_twice(
     photos: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -94,3 +113,24 @@ def test_a_worker_of_another_version_is_refused(photos: list[Path], tmp_path: Pa
 
     with pytest.raises(InputError, match=r"this worker has pycolmap .*, the run 0\..*; install the same"):
         build_features(photos, [None] * len(photos), ReadOptions(tmp_path / "work", engine=Older()))
+
+
+def test_an_error_of_a_process_is_raised_and_ends_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engines, "cores", lambda: 2)
+    children: list[Any] = []
+
+    def started(command: list[str], **given: Any) -> Any:
+        code = "import time; time.sleep(600)" if "long" in command else command[2]
+        children.append(popen([*command[:2], code, *command[3:]], **given))
+        return children[-1]
+
+    popen = engines.subprocess.Popen
+    monkeypatch.setattr(engines.subprocess, "Popen", started)
+    write_task(tmp_path, pairs=[])
+    file = tmp_path / TASK
+    file.write_text(file.read_text().replace('"pycolmap": "', '"pycolmap": "0.'))
+    with pytest.raises(InputError, match=r"this worker has pycolmap .*, the run 0\..*; install the same"):
+        engines.run_in_processes(feature_tasks.match_task, ["long", str(tmp_path)], "poses: matching", QUIET)
+    assert len(children) == 2 and all(child.wait(60) for child in children)
+    with pytest.raises(RuntimeError, match="FileNotFoundError"):
+        engines.run_in_processes(feature_tasks.match_task, [str(tmp_path / "none")], "poses: matching", QUIET)
