@@ -36,6 +36,9 @@ def in_threads(work: Callable[[Item], Result], items: Iterable[Item], most: int 
     """work(item) of each item, in order, as many at a time as there are `cores`, but at most `most`; no more results
     wait than that."""
     most, waiting = min(cores(), most), deque[Future[Result]]()
+    if most == 1:  # a second thread would have a second heap
+        yield from map(work, items)
+        return
     with ThreadPoolExecutor(most) as pool:
         try:
             for item in items:
