@@ -32,10 +32,10 @@ def cores() -> int:
     return max(1, math.ceil(min(_scheduled(), quota)))
 
 
-def in_threads(work: Callable[[Item], Result], items: Iterable[Item], most: int = MOST_THREADS) -> Iterator[Result]:
-    """work(item) of each item, in order, as many at a time as there are `cores`, but at most `most`; no more results
-    wait than that."""
-    most, waiting = min(cores(), most), deque[Future[Result]]()
+def in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    """work(item) of each item, in order, as many at a time as there are `cores`, but at most MOST_THREADS; no more
+    results wait than that."""
+    most, waiting = min(cores(), MOST_THREADS), deque[Future[Result]]()
     if most == 1:  # a second thread would have a second heap
         yield from map(work, items)
         return

@@ -18,13 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from perception.language.ocr import Line, TextReader
+from perception.language.ocr import TextReader
 from perception.language.printed import edit_distance
-from perception.machine import in_threads
 from perception.progress import QUIET, Progress
 
 MOST_VIEWS = 120  # most photos read for a map, those that are best for an instance first: bounds the time
-AT_A_TIME = 2  # photos; each takes 115 MiB, and the networks use all cores for the most part
 MOST_TEXTS = 20  # kept per instance, best supported first
 LEAST = 0.6  # score of a read, and of a text
 SINGLE = 0.8  # score of a text of under FEW characters, or read in one view only
@@ -51,14 +49,9 @@ def read_texts(
         best[view] = min(rank, best.get(view, rank))
     wanted = sorted(sorted(best, key=lambda view: (best[view], view))[:MOST_VIEWS])
     reads: list[list[Read]] = [[] for _ in choices]
-
-    def read(view: int) -> tuple[np.ndarray, list[Line]]:
+    for done, view in enumerate(wanted, start=1):
         photo, ids = load(view)
-        return ids, reader.read(photo)
-
-    each = in_threads(read, wanted, AT_A_TIME)
-    for done, (view, (ids, lines)) in enumerate(zip(wanted, each, strict=True), start=1):
-        for line in lines:
+        for line in reader.read(photo):
             owner = owner_of(line.corners, ids)
             if owner is not None and line.score >= LEAST and sum(c.isalnum() for c in line.text) > 1:
                 reads[owner].append((view, line.text, line.score))
