@@ -81,9 +81,9 @@ class FeatureTasks:
             folders.append(self.folder / f"pairs-{first}-{size}")
             if here or not has_task(folders[-1]):  # an interrupted run's database is gone
                 folders[-1].mkdir(parents=True, exist_ok=True)
-                with closing(sqlite3.connect(database)) as tables:
-                    ids = _images(tables)
                 if not here:
+                    with closing(sqlite3.connect(database)) as tables:
+                        ids = _images(tables)
                     write_part(database, [ids[name] for pair in some for name in pair], folders[-1] / DATABASE)
                 write_task(folders[-1], pairs=some, seed=seed, database=str(database.resolve()) if here else None)
         if here:

@@ -148,7 +148,8 @@ def run_in_processes(task: Callable[[str], Any], items: Sequence[str], what: str
     running: list[subprocess.Popen[str]] = []
 
     def run(item: str) -> None:
-        child = subprocess.Popen([*command, item, *sys.path], stderr=subprocess.PIPE, text=True, start_new_session=True)
+        whole, quiet, heard = [*command, item, *sys.path], subprocess.DEVNULL, subprocess.PIPE
+        child = subprocess.Popen(whole, stdout=quiet, stderr=heard, text=True, start_new_session=True)
         running.append(child)
         said = child.communicate()[1].strip()
         if "Traceback" in said:
