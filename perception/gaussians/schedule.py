@@ -26,6 +26,7 @@ from perception.gaussians.optimiser import Rate
 from perception.gaussians.starved import for_starved_masks
 from perception.gaussians.state import ITERATIONS, TrainingState
 from perception.gaussians.views import TrainingView, psnr, render_view, visible_in
+from perception.machine import return_free_memory
 
 COARSE_UNTIL, COARSE_UNTIL_SMALL, LARGE = 0.4, 0.15, 400
 """Progress until which photos of half the resolution are used: steps are cheaper, and large structures are fitted.
@@ -177,7 +178,9 @@ def _place_in_masks(state: TrainingState) -> None:
     """Adds Gaussians for masks that have too few; above the budget, the faintest make room."""
     with state.record.timed("densification"):
         seed = int(np.random.default_rng([state.config.seed, state.iteration, 3]).integers(2**31))
+        return_free_memory()
         born = for_starved_masks(state.gaussians, state.views, seed)
+        return_free_memory()  # a depth image of every photo
         surplus = len(state.gaussians) + len(born) - max(state.config.train.budget, len(state.gaussians))
         if len(born):
             if surplus > 0:
@@ -200,7 +203,8 @@ def _clear_cameras(state: TrainingState) -> None:
 def _prune(state: TrainingState) -> None:
     """Removes Gaussians with non-finite values, then those that contribute to no pixel of any training view."""
     columns = [tensor.reshape(len(tensor), -1) for tensor in state.gaussians.named().values()]
-    _keep(state, torch.isfinite(torch.cat(columns, dim=1)).all(dim=1), "whose values are not finite")
+    finite = [torch.isfinite(column).all(dim=1) for column in columns]
+    _keep(state, torch.stack(finite).all(dim=0), "whose values are not finite")
     seen = torch.zeros_like(state.gaussians.opacity_logits, dtype=torch.bool)
     seen[: state.held] = True
     with state.record.timed("evaluation"):
@@ -238,6 +242,7 @@ def _end_trial(state: TrainingState, reached: float) -> None:
         _note(state, decision)
         if degree != state.gaussians.sh_degree:
             state.set_degree(degree)
+            return_free_memory()
 
 
 def _stop_early(state: TrainingState) -> None:

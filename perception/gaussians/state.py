@@ -79,7 +79,8 @@ class TrainingState:
 
     gaussians, views, held_out: on the CPU. Gaussians, optimiser and training views are then kept on `device`. box:
     [2, 3] corners of the space that matters, in which most Gaussians are added; None: all. held: the first rows, of
-    which nothing but the colours is trained, and that are never dropped.
+    which nothing but the colours is trained, and that are never dropped. by_stereo: the Gaussians lie on a surface that
+    stereo found, so the space before the cameras is kept free (`free_space`).
     """
 
     def __init__(
@@ -91,6 +92,7 @@ class TrainingState:
         device: torch.device | None = None,
         box: np.ndarray | None = None,
         held: int = 0,
+        by_stereo: bool = False,
     ):
         self.held = held
         self.config = sized(config, len(views))
@@ -105,7 +107,6 @@ class TrainingState:
         self.complete = False  # finished, unless a longer training is requested
         self.skipped = 0.0  # share of training progress skipped by early stopping
         self.initial_count = len(gaussians)
-        by_stereo = any(view.depth is not None and not view.measured for view in views)
         self.free_space = FreeSpace(gaussians.means.cpu().double().numpy(), views) if by_stereo else None
         self.gaussians = gaussians.to(self.device)
         self.reset_statistics()
@@ -202,6 +203,7 @@ class TrainingState:
         The gradients' memory is kept from step to step: rows that a step does not see hold old values, not read.
         """
         self.gaussians = Gaussians(**self.optimiser.params)
+        self.gradients = Gradients()  # frees the former before the next are allocated
         zeros = {name: torch.zeros_like(self.optimiser.params[stored]) for name, stored in STORED.items()}
         zeros[self.growing_by] = self.gaussians.means.new_zeros(1, len(self.gaussians), 2)
         self.gradients = Gradients(**zeros)

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from perception.gaussians.views import TrainingView
+from perception.io.memory import Keep
 from perception.masks.cues import filled_depth
 from perception.masks.stereo import SIDE, make_stereo_view, measure_depths
 from perception.photos.depth import without_edges
@@ -35,11 +36,15 @@ and its depth is a guess: worth 0.5 dB and 4 dB in the worst view (every 6th pho
 
 
 def with_stereo(
-    views: Sequence[View], decoded: list[TrainingView], points: np.ndarray, progress: Progress = QUIET
+    views: Sequence[View],
+    decoded: list[TrainingView],
+    points: np.ndarray,
+    progress: Progress = QUIET,
+    keep: Keep = np.asarray,
 ) -> list[TrainingView]:
-    """The `decoded` photos of `views` with the depth [H, W] that stereo finds, marked as not measured; as given when
+    """The `decoded` photos of `views` with the depth [H, W] that stereo finds, to start Gaussians from; as given when
     any has measured depth or fewer than SIDE pixels on its long side, or where the median one of the sparse points
-    [P, 3] is visible in more than FEW photos."""
+    [P, 3] is visible in more than FEW photos. keep: where images are held."""
     small = any(max(photo.photo.shape) < SIDE for photo in decoded)
     if len(points) < LEAST_POINTS or len(views) < 2 or small or any(view.depth is not None for view in views):
         return decoded
@@ -48,7 +53,7 @@ def with_stereo(
     if np.median(count[count > 0]) > FEW:
         return decoded
     made = [
-        make_stereo_view(view, photo.photo.numpy(), _prior(view, points[mine]), photo.keep) if mine.any() else None
+        make_stereo_view(view, photo.photo.numpy(), _prior(view, points[mine]), keep) if mine.any() else None
         for view, photo, mine in zip(views, decoded, seen, strict=True)
     ]
     measure_depths([stereo for stereo in made if stereo is not None], progress, "stereo")
@@ -58,7 +63,7 @@ def with_stereo(
             kept = without_edges(stereo.depth) * (stereo.confirmed & _textured(stereo.grey))
             depth = cv2.resize(kept.astype(np.float32), photo.photo.shape[1::-1], interpolation=cv2.INTER_NEAREST)
             depth *= 1 if photo.weight is None else photo.weight.numpy() > 0
-            photo = replace(photo, depth=torch.from_numpy(depth), measured=False).stored()
+            photo = replace(photo, depth=torch.from_numpy(keep(depth)))
         found.append(photo)
     return found
 

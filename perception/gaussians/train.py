@@ -108,7 +108,7 @@ class Trainer(TrainingState):
             sh_degree=self.gaussians.sh_degree,
             eps2d=view.eps2d,
             variance=with_features,
-            depth=view.measured and view.depth is not None,
+            depth=view.depth is not None,
             max_records=self._max_records,
         )
         rasterizer = rasterizer_for(self.device)
@@ -154,7 +154,7 @@ class Trainer(TrainingState):
         rgb = photometric(image, target_photo(view, image), SSIM_WEIGHT, view.weight)  # L_RGB, eq. 4
         total, colors = rgb.value, view.exposed(rgb.gradient)[None]
         alphas = depths = features = variance = None
-        if view.measured and view.depth is not None and out.depths is not None:
+        if view.depth is not None and out.depths is not None:
             value, depths, alphas = depth_loss(out.depths[0], out.alphas[0], view.depth)
             total += losses.depth_weight * value
             depths, alphas = losses.depth_weight * depths[None], losses.depth_weight * alphas[None]

@@ -25,8 +25,8 @@ class TrainingView:
     """One photo as used in training. photo [H, W, 3] uint8; labels [H, W] integers (0 = unlabelled) or None;
     K [3, 3] and camera_from_world [4, 4] float32; eps2d: see `rasterize`; weight [H, W] float32: 0 = pixel is ignored,
     None = all pixels count; depth [H, W] float32, what a sensor measured along the optical axis without its edges
-    (`photos.depth.without_edges`), in scene units, 0 = none; or None; measured: False where stereo gave it instead;
-    gain [3] float32: colours of the photo over those of the scene, None = 1. keep: where `stored` puts the images."""
+    (`photos.depth.without_edges`), in scene units, 0 = none; or None; gain [3] float32: colours of the photo over those
+    of the scene, None = 1. keep: where `stored` puts the images."""
 
     name: str
     photo: torch.Tensor
@@ -36,7 +36,6 @@ class TrainingView:
     eps2d: float = 0.3
     weight: torch.Tensor | None = None
     depth: torch.Tensor | None = None
-    measured: bool = True
     gain: torch.Tensor | None = None
     keep: Keep = np.asarray
 
@@ -180,8 +179,7 @@ def surface_depth(gaussians: Gaussians, view: TrainingView) -> np.ndarray:
     """Depth [H, W] float32 along the optical axis of `view`, 0 = no surface: what a sensor measured, and rendered where
     nothing was."""
     rendered = depth_image(gaussians, view.camera_from_world, view.K, *view.photo.shape[1::-1])
-    known = view.depth if view.measured else None
-    return (rendered if known is None else torch.where(known > 0, known, rendered)).numpy()
+    return (rendered if view.depth is None else torch.where(view.depth > 0, view.depth, rendered)).numpy()
 
 
 def psnr(image: torch.Tensor, photo: torch.Tensor, weight: torch.Tensor | None = None) -> float:

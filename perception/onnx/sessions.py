@@ -119,6 +119,7 @@ def open_session(path: Path, threads: int = 0) -> Any:
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     options.intra_op_num_threads = threads
+    options.enable_mem_pattern = False  # one for each shape of the inputs is kept: 93 MiB with texts of 20 photos
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # waiting threads leave the core to others
     try:
         with warnings.catch_warnings():

@@ -115,18 +115,15 @@ def optimise(
     `run.work` on, if there is one."""
     label_by_tasks(run, training, source)
     photos = Photos.load(run, training, held_out)
-    if run.config.losses.depth_weight > 0 and scene.report.get("points_from") != "random":
-        with run.stage("stereo"):
-            photos = replace(photos, views=with_stereo(training, photos.views, scene.points, run.progress))
     config = sized(run.config, len(photos.views), largest_budget(memory_limit()))
-    start = initial_gaussians(scene, config, photos.views)
-    trainer = Trainer(start, photos.views, config, photos.held, run.device, box)
+    start, stereo = _start(run, scene, config, photos)
+    trainer = Trainer(start, photos.views, config, photos.held, run.device, box, by_stereo=bool(stereo))
+    del start
     if config != run.config:
         size = f"{config.train.iterations} iterations, at most {config.train.budget} Gaussians"
         trainer.record.decisions.append(f"size: {size}, for {len(photos.views)} photos")
-    depths = [view.depth for view in photos.views if view.depth is not None and not view.measured]
-    if found := [float((depth > 0).double().mean()) for depth in depths]:
-        trainer.record.decisions.append(f"stereo: depth in {np.mean(found):.0%} of the pixels of {len(found)} photos")
+    if stereo:
+        trainer.record.decisions.append(f"stereo: depth in {np.mean(stereo):.0%} of the pixels of {len(stereo)} photos")
     masks_enter = GEOMETRY_START if source.needs_depth else config.losses.start
     observer = TrainingObserver(run.work, run.mark, source.identity, masks_enter, run.progress)
     observer.take_up(trainer)
@@ -145,6 +142,18 @@ def optimise(
     del trainer, observer
     return_free_memory()
     return optimised
+
+
+def _start(run: Run, scene: Scene, config: MapConfig, photos: Photos) -> tuple[Gaussians, list[float]]:
+    """The first Gaussians, and the share of the pixels of each photo of which stereo found the depth. That depth is not
+    kept: held to it, the Gaussians fit the photos less."""
+    views = photos.views
+    if config.losses.depth_weight > 0 and scene.report.get("points_from") != "random":
+        with run.stage("stereo"):
+            views = with_stereo(photos.training, views, scene.points, run.progress, run.new_keep())
+    depths = [view.depth for view, photo in zip(views, photos.views, strict=True) if view is not photo]
+    shares = [float((depth > 0).double().mean()) for depth in depths if depth is not None]
+    return initial_gaussians(scene, config, views), shares
 
 
 def initial_gaussians(scene: Scene, config: MapConfig, views: Sequence[TrainingView] = ()) -> Gaussians:
@@ -203,7 +212,7 @@ def label_photos(
             run.progress,
             load_depth=lambda view: depth(by_name[view.name]),
             depth_key=f"{run.mark} at progress {GEOMETRY_START}" if source.needs_depth else f"{side} px",
-            keep=run.keep,
+            keep=run.new_keep(),
         )
         for warning in report["warnings"]:
             run.progress.log(f"warning: {warning}")

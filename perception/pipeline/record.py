@@ -86,7 +86,7 @@ def score_views(gaussians: Gaussians, views: list[TrainingView], metric: bool = 
 
 def depth_used(views: list[TrainingView]) -> dict[str, Any] | None:
     """Number of training views with a depth image and the share of their pixels that has depth; None without any."""
-    shares = [float((view.depth > 0).double().mean()) for view in views if view.depth is not None and view.measured]
+    shares = [float((view.depth > 0).double().mean()) for view in views if view.depth is not None]
     return {"views": len(shares), "measured": round(float(np.mean(shares)), 4)} if shares else None
 
 

@@ -9,13 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from perception.config import load_config
 from perception.gaussians.depth_start import start_on_surface
-from perception.gaussians.model import from_points
 from perception.gaussians.stereo import FEW, LEAST_POINTS, with_stereo
-from perception.gaussians.train import Trainer
-from perception.gaussians.views import TrainingView, surface_depth
-from perception.pipeline.record import depth_used
+from perception.gaussians.views import TrainingView
 from perception.types import DepthImage, View
 from support.two_walls import HALF, HEIGHT, NEAR, SLOPE, WIDTH, sparse, taken
 
@@ -35,10 +31,10 @@ def test_depths_are_right_where_photos_agree(shots):
     for view, depth in zip(found, depths, strict=True):
         known = view.depth.numpy() > 0
         error = np.abs(view.depth.numpy() / depth - 1)[known]
-        assert not view.measured
         assert known.mean() > 0.4
         assert np.median(error) < 0.01
         assert (error < 0.05).mean() > 0.97  # the walls are 35 % apart
+    assert all(view.depth is None for view in decoded)  # what training sees
     start = start_on_surface(found, sparse(300), np.zeros((300, 3), np.uint8), 2000, 2, 0)
     x, y, z = start.means.double().numpy().T
     behind = np.abs(y - 4 - SLOPE * x) / 4
@@ -55,21 +51,3 @@ def test_stereo_is_left_out_where_it_is_not_needed(shots):
     assert with_stereo(views, halves, sparse(300)) is halves
     many = FEW // len(views) + 1  # so that each point is in more than FEW photos
     assert with_stereo(many * views, many * decoded, sparse(300)) == many * decoded
-
-
-def test_stereo_is_only_a_start_and_is_not_called_a_sensor(shots):
-    _, view, depth = shots[0]
-    depth = torch.from_numpy(depth.astype(np.float32))
-    measured = replace(view, depth=depth)
-    found = replace(measured, measured=False)
-    points = sparse(300)
-    losses = []
-    for shown in (view, measured, found):
-        gaussians = from_points(points, np.full((300, 3), 128, np.uint8), feature_dim=8, seed=0)
-        pairs = ["train.iterations=10", "losses.half_resolution=false", "train.sh_degree=0"]
-        losses.append(Trainer(gaussians, [shown], load_config(pairs=pairs), []).step(0.0))
-    assert losses[2] == losses[0] < losses[1]
-    assert depth_used([found]) is None
-    assert depth_used([found, measured]) == {"views": 1, "measured": 1.0}
-    assert np.array_equal(surface_depth(gaussians, measured), depth.numpy())
-    assert np.array_equal(surface_depth(gaussians, found), surface_depth(gaussians, view))

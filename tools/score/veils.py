@@ -92,9 +92,11 @@ def measure(scene: Scene, left_out: list[View], config: MapConfig, folder: Path)
     views, held = load_all(training, side, Progress(quiet=True)), load_all(held_out, side, Progress(quiet=True))
     started, cpu = time.perf_counter(), time.process_time()
     config = sized(config, len(views))
+    started_from = views
     if config.losses.depth_weight > 0:
-        views = with_stereo(training, views, scene.points)
-    trainer = Trainer(initial_gaussians(scene, config, views), views, config, held)
+        started_from = with_stereo(training, views, scene.points)
+    start = initial_gaussians(scene, config, started_from)
+    trainer = Trainer(start, views, config, held, by_stereo=started_from is not views)
     trainer.run()
     seconds, cpu = time.perf_counter() - started, time.process_time() - cpu
     gaussians = trainer.gaussians
