@@ -37,13 +37,13 @@ class FreeSpace:
         """[N] bool: whether each Gaussian reaches, by a standard deviation, into the space around a camera, and was not
         measured there."""
         means, scales = gaussians.means.double(), gaussians.scales.double()
-        axes = rotation_matrices(gaussians.quats).double()
         least = torch.full_like(means[:, 0], torch.inf)  # radius of the balls that each Gaussian reaches into
         found = least < 0
         for center, radius, near in self._near(gaussians):
             away = torch.from_numpy(center).to(means) - means[near]
             distance = away.square().sum(dim=1).sqrt()
-            toward = (away[:, :, None] * axes[near]).sum(dim=1) / distance.clamp(min=1e-9)[:, None]
+            axes = rotation_matrices(gaussians.quats[near]).double()
+            toward = (away[:, :, None] * axes).sum(dim=1) / distance.clamp(min=1e-9)[:, None]
             extent = (scales[near] * toward).square().sum(dim=1).sqrt()  # standard deviation on the ray to the camera
             reaching = distance - extent < radius
             found[near[reaching & (extent > MEASURED * radius)]] = True

@@ -18,6 +18,7 @@ from perception.gaussians.photos import split_scene
 from perception.inputs.load import load_scene
 from perception.language.base import Encoder
 from perception.language.ocr import TextReader, make_reader
+from perception.machine import return_free_memory
 from perception.map.checksums import is_map
 from perception.map.files import read_info
 from perception.map.write import Map, read_map, write_map
@@ -86,6 +87,8 @@ def build_map(
         with run.stage("instances"):
             grouped = group_gaussians(optimised, run, segments)
             described = describe(optimised, grouped, run, encoder, reader)
+        del encoder, reader  # with their networks
+        return_free_memory()
         gmap = _assemble(run, scene, optimised, described, output, splat)
         write_map(output, gmap, fresh=True)
     _log_result(gmap, output, progress)
