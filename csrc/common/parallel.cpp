@@ -80,18 +80,20 @@ class Pool {
   std::atomic<bool> busy{false};  // one job at a time; a second caller, or a task that asks for tasks, runs alone
 
  private:
+  // Spins only where it has a core, and the job before wanted it: idle threads would take the time of the others.
   void loop(int worker) {
+    const bool has_core = worker < hardware_threads();
+    bool wanted = true;
     for (unsigned long seen = 0;;) {
       const auto called = [&] { return generation_ != seen; };
-      const bool at_once = spin(called);
+      if (wanted && has_core) spin(called);
       std::unique_lock<std::mutex> lock(mutex_);
-      if (!at_once) {
-        ++asleep_;
-        wake_.wait(lock, called);
-        --asleep_;
-      }
+      ++asleep_;
+      wake_.wait(lock, called);
+      --asleep_;
       seen = generation_;
-      if (worker > wanted_) continue;
+      wanted = worker <= wanted_;
+      if (!wanted) continue;
       Job *job = job_;
       lock.unlock();
       job->work(worker);
