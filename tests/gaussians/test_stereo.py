@@ -9,9 +9,13 @@ import numpy as np
 import pytest
 import torch
 
+from perception.config import load_config
 from perception.gaussians.depth_start import start_on_surface
+from perception.gaussians.model import from_points
 from perception.gaussians.stereo import FEW, LEAST_POINTS, with_stereo
-from perception.gaussians.views import TrainingView
+from perception.gaussians.train import Trainer
+from perception.gaussians.views import TrainingView, surface_depth
+from perception.pipeline.record import depth_used
 from perception.types import DepthImage, View
 from support.two_walls import HALF, HEIGHT, NEAR, SLOPE, WIDTH, sparse, taken
 
@@ -51,3 +55,17 @@ def test_stereo_is_left_out_where_it_is_not_needed(shots):
     assert with_stereo(views, halves, sparse(300)) is halves
     many = FEW // len(views) + 1  # so that each point is in more than FEW photos
     assert with_stereo(many * views, many * decoded, sparse(300)) == many * decoded
+
+
+def test_what_a_sensor_measured_is_a_surface_and_a_loss(shots):
+    _, view, depth = shots[0]
+    measured = replace(view, depth=torch.from_numpy(depth.astype(np.float32)))
+    starts = [from_points(sparse(300), np.full((300, 3), 128, np.uint8), feature_dim=8, seed=0) for _ in range(2)]
+    assert np.array_equal(surface_depth(starts[0], measured), measured.depth.numpy())
+    assert depth_used([view]) is None
+    assert depth_used([view, measured]) == {"views": 1, "measured": 1.0}
+    losses = []
+    for start, shown in zip(starts, (view, measured), strict=True):
+        pairs = ["train.iterations=10", "losses.half_resolution=false", "train.sh_degree=0"]
+        losses.append(Trainer(start, [shown], load_config(pairs=pairs), []).step(0.0))
+    assert losses[0] < losses[1]
