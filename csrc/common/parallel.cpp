@@ -3,6 +3,7 @@
 #include <pthread.h>
 
 #include <algorithm>
+#include <array>
 #include <atomic>
 #include <chrono>
 #include <condition_variable>
@@ -69,8 +70,8 @@ class Pool {
       wanted_ = helpers;
       running_ = helpers;
       ++generation_;
-      if (asleep_ > 0) wake_.notify_all();
     }
+    for (int i = 0; i < helpers; ++i) wake_[i].notify_one();
     job.work(0);
     if (spin([this] { return running_ == 0; })) return;
     std::unique_lock<std::mutex> lock(mutex_);
@@ -80,20 +81,14 @@ class Pool {
   std::atomic<bool> busy{false};  // one job at a time; a second caller, or a task that asks for tasks, runs alone
 
  private:
-  // Spins only where it has a core, and the job before wanted it: idle threads would take the time of the others.
+  // Woken only where the job wants it; spins after a job only where it has a core: the others' time is theirs.
   void loop(int worker) {
     const bool has_core = worker < hardware_threads();
-    bool wanted = true;
     for (unsigned long seen = 0;;) {
-      const auto called = [&] { return generation_ != seen; };
-      if (wanted && has_core) spin(called);
+      if (has_core) spin([&] { return generation_ != seen; });
       std::unique_lock<std::mutex> lock(mutex_);
-      ++asleep_;
-      wake_.wait(lock, called);
-      --asleep_;
+      wake_[worker - 1].wait(lock, [&] { return generation_ != seen && worker <= wanted_; });
       seen = generation_;
-      wanted = worker <= wanted_;
-      if (!wanted) continue;
       Job *job = job_;
       lock.unlock();
       job->work(worker);
@@ -103,9 +98,10 @@ class Pool {
   }
 
   std::mutex mutex_;
-  std::condition_variable wake_, done_;
+  std::array<std::condition_variable, kMaxThreads> wake_;  // of each thread
+  std::condition_variable done_;
   Job *job_ = nullptr;  // of a past generation, all its helpers are done and none reads it
-  int started_ = 0, wanted_ = 0, asleep_ = 0;
+  int started_ = 0, wanted_ = 0;
   std::atomic<int> running_{0};
   std::atomic<unsigned long> generation_{0};
 };
