@@ -1,4 +1,6 @@
-"""Scores, parts and groups of instances, from the cuts of the surface that the built-in masks made."""
+"""Instances without those that are hardly objects; their scores, parts and groups from the cuts of the surface that the
+built-in masks made.
+"""
 
 from __future__ import annotations
 
@@ -20,15 +22,19 @@ LEAST_SCORE = 0.05  # instances of less are pieces of others, as a rule; from 0.
 
 
 def without_faint(
-    grouping: Grouping, means: np.ndarray, opacities: np.ndarray, votes: MaskVotes, cuts: Segmentation
+    grouping: Grouping, means: np.ndarray, opacities: np.ndarray, votes: MaskVotes, cuts: Segmentation | None = None
 ) -> Grouping:
-    """`with_levels`, in which the Gaussians of instances below LEAST_SCORE are those of their neighbours or of none."""
-    found = with_levels(grouping, means, votes, cuts)
-    faint = np.append(found.scores < LEAST_SCORE, False)  # the last for −1
+    """The grouping, by `with_levels` if there are cuts, in which the Gaussians of instances below LEAST_SCORE are those
+    of their neighbours or of none. means [N, 3], opacities [N]. What no mask of other sources shows, 0, is kept."""
+    found = grouping if cuts is None else with_levels(grouping, means, votes, cuts)
+    faint = (found.scores < LEAST_SCORE) & ((found.scores > 0) | (cuts is not None))
     if not faint.any():
         return found
-    ids = reassign(np.where(faint[found.ids], -1, found.ids), means, opacities, votes, MIN_OPACITY)
-    return with_levels(scored(ids, np.full(len(ids), -1), np.zeros(0, np.int64), votes), means, votes, cuts)
+    left = np.where(np.append(faint, False)[found.ids], -1, found.ids)  # the last for −1
+    ids = reassign(left, means, opacities, votes, MIN_OPACITY)
+    parts = np.where(found.part_ids >= 0, found.part_ids - found.count, -1)
+    kept = scored(ids, parts, np.array(found.parents, np.int64), votes)
+    return kept if cuts is None else with_levels(kept, means, votes, cuts)
 
 
 def with_levels(grouping: Grouping, means: np.ndarray, votes: MaskVotes, cuts: Segmentation) -> Grouping:

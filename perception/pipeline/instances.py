@@ -71,7 +71,9 @@ def group_gaussians(optimised: Optimised, run: Run, segments: Segmentation | Non
     arrays = (means, scales, opacities, features, votes)
     one_surface = segments is not None and len(segments.probability) <= LARGEST + 1
     grouping = group(*arrays, config.instances, margin=margin, seed=config.seed, one_surface=one_surface)
-    return grouping if segments is None else without_faint(grouping, means, opacities, votes, segments)
+    if segments is None and not config.instances.settle:
+        return grouping
+    return without_faint(grouping, means, opacities, votes, segments)
 
 
 def describe(

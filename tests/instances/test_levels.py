@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -65,3 +67,22 @@ def test_what_is_hardly_an_object_joins_the_neighbour_whose_masks_show_it() -> N
     found = without_faint(grouping, means, np.ones(84), votes, cuts)
     assert found.ids.tolist() == [0] * 44 + [1] * 40
     np.testing.assert_allclose(found.scores, ODDS * (q := np.array([0.2, 0.9])) / (1 - q + ODDS * q))
+
+
+def test_of_other_masks_the_faint_join_too_but_not_what_no_mask_shows() -> None:
+    """One photo with two masks: of 44 Gaussians of which 4 are instance 1, and of 40. 20 more lie in no mask."""
+    lines = [np.linspace(*line) for line in ((0, 1.1, 40), (1.1, 1.2, 4), (8.9, 9.1, 40), (50, 50, 20))]
+    x = np.concatenate(lines)
+    means = np.stack([x, np.zeros(104), np.zeros(104)], axis=1)
+    ids, masked = np.repeat([0, 3, 1, 2], [40, 4, 40, 20]).astype(np.int32), np.arange(84)
+    pixels = sparse.csr_matrix((np.full(84, 9.0, np.float32), (masked, np.repeat([0, 1], [44, 40]))), shape=(104, 2))
+    void = sparse.csr_matrix((np.full(20, 9.0, np.float32), (np.arange(84, 104), np.zeros(20, int))), shape=(104, 1))
+    votes = MaskVotes(pixels, void, np.zeros(2, np.int64), np.array([396.0, 360]))
+    parts = np.where((x > 1.05) & (x < 1.15), 5, np.where(x > 9, np.where(x < 10, 4, -1), -1))  # of 3 and of 1
+    scores, of_parts = np.array([0.9, 0.9, 0, 0.01]), ([1, 3], [0.5, 0.5], [1, 1])
+    grouping = Grouping(ids, np.ones(104), scores, parts.astype(np.int32), *of_parts)
+    found = without_faint(grouping, means, np.ones(104), votes)
+    assert found.ids.tolist() == [0] * 44 + [1] * 40 + [2] * 20 and found.scores[2] == 0
+    assert found.parents == [1] and (np.flatnonzero(found.part_ids == 3) == np.flatnonzero(parts == 4)).all()
+    sure = replace(grouping, scores=np.array([0.9, 0.9, 0, 0.9]))
+    assert without_faint(sure, means, np.ones(104), votes) is sure

@@ -7,8 +7,9 @@ WORK/NAME the maps and WORK/NAME.json the figures, so that a run that was stoppe
 program. AP is class-agnostic by ScanNet's rules. Where only things are known (kitchen, shelf) `own` is the share of
 the things that some instance finds, or the mean of their IoU in the photos. --splats NAME maps the Gaussians alone of
 WORK/NAME's maps again, as finished splats, scored in these maps' frame; --against WORK/NAME.json is then what is lost.
-Spread: standard deviation over the seeds; over all places, its root mean square. Worst: mean of the lowest tenth of the
-maps, at least of one.
+--fit prints the scores that the instances of these maps and of those --against would have by their own share right: a
+second row for `confidence.CALIBRATION`. Spread: standard deviation over the seeds; over all places, its root mean
+square. Worst: mean of the lowest tenth of the maps, at least of one.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from perception.bench.output import Column, table
 from perception.boxes import oriented_box
 from perception.config import MapConfig, load_config
 from perception.errors import InputError
+from perception.instances.confidence import CALIBRATION
 from perception.io.atomic import atomic_file
 from perception.io.documents import read_json
 from perception.map.map import Map
@@ -37,7 +39,7 @@ from perception.pipeline.mapping import build_map
 from perception.progress import Progress
 from score.instances import MIN_POINTS, read_scene, read_truth_cloud
 from score.photos import overlaps
-from score.reliability import draw, reliability
+from score.reliability import draw, fitted, reliability
 from training import clutter, patchwork
 from worlds import scene as scenes
 
@@ -101,7 +103,7 @@ def config_of(place: Place, seed: int, masks: str, pairs: Iterable[str]) -> MapC
 
 def score(gmap: Map, folder: Path, frame: Map | None = None) -> dict[str, Any]:
     """FIGURES that the scene's truth gives, in the frame of another map if one is given, and (score, right) of the
-    instances where each point's truth is known."""
+    instances where each point's truth is known: `scored` of those of MIN_POINTS or more, `every` of all."""
     about = read_scene(folder)
     if "things" in about:
         truths, things = LabelFolder(folder / "masks_gt"), [int(thing) for thing in about["things"]]
@@ -119,9 +121,11 @@ def score(gmap: Map, folder: Path, frame: Map | None = None) -> dict[str, Any]:
     true, names = read_truth(truth), {entry["id"]: entry["name"] for entry in about["instances"]}
     overlap = overlap_of_ids(labels, confidence, true)
     right = np.stack([overlap.pred_scores, overlap.iou.max(axis=1, initial=0) > 0.5], axis=1)
+    without = sorted(set(confidence) - set(np.unique(labels).tolist()))
     return {
         **{name: float(found[name]) for name in ("ap", "ap50", "ap25")},
         "scored": right[overlap.pred_sizes >= MIN_POINTS].tolist(),
+        "every": right.tolist() + [[confidence[one], 0.0] for one in without],
         "boxes": box_ratios(gmap, cloud.points[truth >= 0], truth[truth >= 0], labels[truth >= 0]),
         "missed": [names[i] for i, iou in zip(true.ids, overlap.iou.max(axis=0, initial=0), strict=True) if iou <= 0.5],
     }
@@ -200,10 +204,10 @@ def text_of(maps: list[dict[str, Any]], against: list[dict[str, Any]]) -> str:
     for name, head in zip(FIGURES, HEADS, strict=True):
         columns += [(head, f"{name}_mean", ".3f"), ("±", f"{name}_spread", ".3f"), ("worst", f"{name}_worst", ".3f")]
     lines = [table(rows_of(maps), columns, ("place",))]
-    pairs = [pair for one in maps for pair in one.get("scored", [])]
-    if pairs:
-        found = reliability(*np.array(pairs).T)
-        lines.append(f"scores of instances: expected calibration error {found['ece']:.3f} over {found['count']}")
+    for kind, what in (("scored", f"instances of {MIN_POINTS} points or more"), ("every", "all instances")):
+        if pairs := [pair for one in maps for pair in one.get(kind, [])]:
+            found = reliability(*np.array(pairs).T)
+            lines.append(f"scores of {what}: expected calibration error {found['ece']:.3f} over {found['count']}")
     ratios = np.array([ratio for one in maps for ratio in one.get("boxes", [])])
     if len(ratios):
         wrong = np.mean((ratios > OFF) | (ratios < 1 / OFF))
@@ -238,6 +242,7 @@ def main() -> None:
     parser.add_argument("--name", help="of the folder of maps and the JSON (that of the masks)")
     parser.add_argument("--against", type=Path, metavar="FILE", help="JSON of another run to compare with")
     parser.add_argument("--splats", metavar="NAME", help="maps the splats of the maps in WORK/NAME again")
+    parser.add_argument("--fit", action="store_true", help="scores by the share right, for masks labels, labels_sam")
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draws the reliability of scores (matplotlib)")
     parser.add_argument("--cpu-minutes", type=float, default=120, help="after which no other map is begun (120)")
     options = parser.parse_args()
@@ -258,7 +263,12 @@ def main() -> None:
         figures = "/".join(f"{one[name]:.3f}" for name in FIGURES if name in one)
         print(f"{place.name} {seed}: {figures}, {one['cpu_seconds']:.0f} CPU s", flush=True)
     maps = [known[place.name, seed] for place, seed in wanted if (place.name, seed) in known]
-    print(text_of(maps, read_json(options.against)["maps"] if options.against else []))
+    against = read_json(options.against)["maps"] if options.against else []
+    print(text_of(maps, against))
+    if options.fit:
+        raw, score = CALIBRATION
+        p, right = np.array([pair for one in maps + against for pair in one.get("every", [])]).T
+        print(np.round(fitted(np.interp(p, score, raw), right > 0, raw), 3).tolist())
     if options.plot:
         scored = np.array([pair for one in maps for pair in one.get("scored", [])])
         draw(reliability(*scored.T), "instances", options.plot)

@@ -17,6 +17,7 @@ from perception.errors import InputError
 
 SCORED = "scored"
 BINS = 10
+PRIOR = 0.1  # events, of `fitted`
 COLUMNS: tuple[Column, ...] = (("count", "count", "d"), ("mean p", "mean", ".3f"), ("right", "right", ".3f"))
 
 
@@ -46,6 +47,22 @@ def reliability(p: np.ndarray, right: np.ndarray) -> dict[str, Any]:
         for b in np.flatnonzero(count).tolist()
     ]
     return {"ece": float(np.abs(sums[0] - sums[1]).sum() / max(len(p), 1)), "count": len(p), "bins": bins}
+
+
+def fitted(x: np.ndarray, right: np.ndarray, knots: Sequence[float]) -> np.ndarray:
+    """The probabilities at `knots`, from 0 at the first to 1 at the last, strictly rising and linear between them, that
+    make the outcomes right [N] bool of events at x [N] most likely. PRIOR on each rise keeps it above 0."""
+    from scipy.optimize import minimize
+    from scipy.special import log_softmax
+
+    def values(rises: np.ndarray) -> np.ndarray:
+        return np.append(0.0, np.cumsum(np.exp(log_softmax(rises))))
+
+    def loss(rises: np.ndarray) -> float:
+        p = np.interp(x, knots, values(rises)).clip(1e-4, 1 - 1e-4)
+        return float(-np.log(np.where(right, p, 1 - p)).sum() - PRIOR * log_softmax(rises).sum())
+
+    return values(minimize(loss, np.zeros(len(knots) - 1)).x)
 
 
 def draw(found: dict[str, Any], what: str, file: Path) -> None:
