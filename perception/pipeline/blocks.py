@@ -23,7 +23,7 @@ from perception.gaussians.model import Gaussians, Nearby
 from perception.gaussians.state import TrainRecord, sized
 from perception.gaussians.stereo import visible_points
 from perception.gaussians.views import surface_depth
-from perception.geometry import camera_centres
+from perception.geometry import camera_centres, rotations
 from perception.machine import memory_limit
 from perception.map.replace import writing
 from perception.masks import MaskSource, make_source
@@ -58,6 +58,20 @@ class Block:
     def owns(self, points: np.ndarray) -> np.ndarray:
         """[P] bool of points [P, 3]."""
         return np.asarray(((points >= self.low) & (points < self.high)).all(axis=1))
+
+    def adds(self, gaussians: Gaussians, centres: np.ndarray) -> np.ndarray:
+        """[N] bool: of the Gaussians that were trained on photos from centres [C, 3], those whose mean the block owns.
+        Not one that leaves the box and is longer (standard deviation) than its distance to the nearest camera: it has
+        no place that a linear projection could draw, and only this block's photos saw to it that it hides nothing."""
+        from scipy.spatial import cKDTree
+
+        means, scales = gaussians.means.numpy().astype(np.float64), gaussians.scales.numpy().astype(np.float64)
+        adds, longest = self.owns(means), scales.argmax(axis=1)
+        length = scales[np.arange(len(means)), longest]
+        long = np.flatnonzero(adds & (length > cKDTree(centres).query(means)[0]))
+        half = length[long, None] * rotations(gaussians.quats.numpy()[long])[np.arange(len(long)), :, longest[long]]
+        adds[long] = self.owns(means[long] - half) & self.owns(means[long] + half)
+        return adds
 
 
 def cut(scene: Scene, most: int) -> list[Block]:
@@ -145,7 +159,8 @@ def optimise_blocks(
         if state is None:
             raise InputError(f"{folder}: has no {RESULT} after its task; workers must share the output's folder")
         gaussians, record = Gaussians(**state["gaussians"]), TrainRecord(**state["record"])
-        own = torch.from_numpy(np.flatnonzero(block.owns(gaussians.means.numpy())))
+        centres = camera_centres(np.stack([scene.views[i].camera_from_world for i in block.views]))
+        own = torch.from_numpy(np.flatnonzero(block.adds(gaussians, centres)))
         parts.append(gaussians.rows(own))
         records.append(record)
         box = [[float(x) if np.isfinite(x) else None for x in corner] for corner in (block.low, block.high)]

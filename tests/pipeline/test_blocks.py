@@ -22,7 +22,7 @@ from perception.geometry import camera_centres
 from perception.map.write import Map
 from perception.pipeline import blocks as module
 from perception.pipeline import photo_tasks
-from perception.pipeline.blocks import APART, cut, joined, nearby_rows, optimise_block
+from perception.pipeline.blocks import APART, Block, cut, joined, nearby_rows, optimise_block
 from perception.pipeline.checkpoint import work_folder
 from perception.pipeline.mapping import build_map
 from perception.pipeline.optimise import Run
@@ -293,3 +293,23 @@ def test_no_cluster_at_an_address_is_one_line() -> None:
     pytest.importorskip("ray")
     with pytest.raises(InputError, match=r"--address 127\.0\.0\.1:1: no Ray cluster there .*ray start --head"):
         Engine("ray", "127.0.0.1:1").run(optimise_block, ["x"], "block", None)  # type: ignore[arg-type]
+
+
+def test_a_block_does_not_add_what_leaves_it_longer_than_its_nearest_camera_is_far() -> None:
+    """The block owns x < 1, its camera stands 2 from the origin. Only the needle that crosses x = 1 is left out."""
+    block = Block(np.full(3, -np.inf), np.array([1, np.inf, np.inf]), np.arange(1))
+    about = {  # mean x: longest σ, its axis as a quaternion of the x axis
+        "small, across the border": (0.95, 0.1, (1, 0, 0, 0)),
+        "long, shorter than the camera is far": (0.0, 1.9, (1, 0, 0, 0)),
+        "a needle across the border": (0.0, 2.1, (1, 0, 0, 0)),
+        "a needle along the border": (0.0, 9.0, (np.sqrt(0.5), 0, 0, np.sqrt(0.5))),  # 90° about z
+        "another block's": (1.5, 0.1, (1, 0, 0, 0)),
+    }
+    x, length, quats = (np.array(each) for each in zip(*about.values(), strict=True))
+    means = np.stack([x, np.zeros(5), np.zeros(5)], axis=1)
+    gaussians = from_points(means, np.zeros((5, 3), np.uint8), feature_dim=3, seed=0)
+    scales = torch.from_numpy(np.stack([length, np.full(5, 0.05), np.full(5, 0.05)], axis=1)).float()
+    gaussians = replace(gaussians, quats=torch.from_numpy(quats).float(), log_scales=scales.log())
+    assert block.adds(gaussians, np.array([[0.0, 0, 2]])).tolist() == [True, True, False, True, False]
+    everything = Block(np.full(3, -np.inf), np.full(3, np.inf), np.arange(1))
+    assert everything.adds(gaussians, np.array([[0.0, 0, 2]])).all()
