@@ -23,7 +23,7 @@ from perception.gaussians.model import Gaussians, Nearby
 from perception.gaussians.state import TrainRecord, sized
 from perception.gaussians.stereo import visible_points
 from perception.gaussians.views import surface_depth
-from perception.geometry import camera_centres, rotations
+from perception.geometry import camera_centres, nearest, rotations
 from perception.machine import memory_limit
 from perception.map.replace import writing
 from perception.masks import MaskSource, make_source
@@ -65,10 +65,11 @@ class Block:
         no place that a linear projection could draw, and only this block's photos saw to it that it hides nothing."""
         from scipy.spatial import cKDTree
 
-        means, scales = gaussians.means.numpy().astype(np.float64), gaussians.scales.numpy().astype(np.float64)
-        adds, longest = self.owns(means), scales.argmax(axis=1)
-        length = scales[np.arange(len(means)), longest]
-        long = np.flatnonzero(adds & (length > cKDTree(centres).query(means)[0]))
+        means = gaussians.means.numpy()
+        adds = self.owns(means)
+        length, longest = (each.numpy() for each in gaussians.scales.max(dim=1))
+        rows = np.flatnonzero(adds)
+        long = rows[length[rows] > nearest(cKDTree(centres), means[rows], [1])[0][:, 0]]
         half = length[long, None] * rotations(gaussians.quats.numpy()[long])[np.arange(len(long)), :, longest[long]]
         adds[long] = self.owns(means[long] - half) & self.owns(means[long] + half)
         return adds

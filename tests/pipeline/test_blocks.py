@@ -313,3 +313,5 @@ def test_a_block_does_not_add_what_leaves_it_longer_than_its_nearest_camera_is_f
     assert block.adds(gaussians, np.array([[0.0, 0, 2]])).tolist() == [True, True, False, True, False]
     everything = Block(np.full(3, -np.inf), np.full(3, np.inf), np.arange(1))
     assert everything.adds(gaussians, np.array([[0.0, 0, 2]])).all()
+    gaussians.means[0, 0] = torch.nan
+    assert everything.adds(gaussians, np.array([[0.0, 0, 2]])).tolist() == [False, True, True, True, True]
