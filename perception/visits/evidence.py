@@ -24,6 +24,11 @@ UNSEEN = 0.12
 WEIGHTS = {"correlation": (14.0, 0.52), "outline": (3.0, 0.60), "colour": (-8.0, 0.12), "through": (-2.0, 0.20)}
 """Log-odds of "still there" per unit of each sign, and the value at which a sign says nothing."""
 
+BLURRED = 0.35, 0.55
+"""Variance of brightness in the map over that in the photos, up to which the map is too blurred for a low correlation
+to say that a thing is gone, and from which that counts in full. Far floors of small maps have .27 to .35, things that
+are gone .55 and more: of 45 on made visits two have less, which other signs tell."""
+
 SAME_OUTLINE = 6.0
 """Further log-odds per unit of the outlines' IoU for a thing at a new spot, where another thing may stand."""
 
@@ -39,7 +44,8 @@ TEMPER = 2.0
 class Signs:
     """What a visit shows of one thing. pixels: that look at it, in photos; share: of its surface that was seen, in
     [0, 1]; correlation, outline (IoU with a mask), colour (difference), through and hit (shares of measured rays that
-    end behind it and at it); NaN where nothing was measured."""
+    end behind it and at it); NaN where nothing was measured. contrast: variance of brightness in the map over that in
+    the photos; measured: share of its pixels whose ray was measured."""
 
     photos: int
     pixels: int
@@ -49,12 +55,28 @@ class Signs:
     colour: float
     through: float
     hit: float
+    contrast: float
+    measured: float
 
     @property
     def log_odds(self) -> float:
-        """Of the thing standing where it stood, positive for yes."""
-        values = ((getattr(self, name), *weight) for name, weight in WEIGHTS.items())
-        return float(sum(slope * (value - middle) for value, slope, middle in values if np.isfinite(value)))
+        """Of the thing standing where it stood, positive for yes: `alike`, but for what a blurred map and rays that
+        were not measured cannot say."""
+        sharp = float(np.clip((self.contrast - BLURRED[0]) / (BLURRED[1] - BLURRED[0]), 0, 1))
+        told = self._told
+        against = min(0.0, told["correlation"])
+        return sum(told.values()) - (1 - sharp) * against - (1 - self.measured) * told["through"]
+
+    @property
+    def alike(self) -> float:
+        """Log-odds of the photos showing what the map does, blurred or not."""
+        return sum(self._told.values())
+
+    @property
+    def _told(self) -> dict[str, float]:
+        """Log-odds that each sign adds."""
+        values = {name: (getattr(self, name), *weight) for name, weight in WEIGHTS.items()}
+        return {name: slope * (v - middle) if np.isfinite(v) else 0.0 for name, (v, slope, middle) in values.items()}
 
     @property
     def same(self) -> float:
@@ -62,7 +84,7 @@ class Signs:
         if not self.photos:
             return HIDDEN
         outline = 0.0 if np.isnan(self.outline) else SAME_OUTLINE * (self.outline - WEIGHTS["outline"][1])
-        return self.log_odds + outline
+        return self.alike + outline
 
     @property
     def seen(self) -> bool:
@@ -115,14 +137,14 @@ def sums_in(
 
 def signs_from(row: np.ndarray, share: float) -> Signs:
     """The signs whose sums over all photos are `row` [11]."""
-    photos, pixels, product, a, b, outline, labelled, colour, measured, through, hit = row.tolist()
+    photos, pixels, product, a, b, outline, labelled, colour, rays, through, hit = row.tolist()
 
     def over(x: float, y: float) -> float:
         return x / y if y else float("nan")
 
     known = correlation(product, a, b) if pixels else float("nan")
-    rays = (over(through, measured), over(hit, measured))
-    return Signs(int(photos), int(pixels), share, known, over(outline, labelled), over(colour, pixels), *rays)
+    means = over(outline, labelled), over(colour, pixels), over(through, rays), over(hit, rays)
+    return Signs(int(photos), int(pixels), share, known, *means, a / max(b, 1e-12), rays / max(pixels, 1))
 
 
 def seen_rows(looks: Sequence[Look], means: np.ndarray, scales: np.ndarray) -> np.ndarray:

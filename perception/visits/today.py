@@ -155,7 +155,7 @@ def _shown_before(
     anywhere = np.full(len(things), np.inf)  # what is in front of the old surface counts, too
     signs = signs_of(looks, range(len(things)), np.ones(len(things)), anywhere)
     fresh = instead > INSTEAD * pixels
-    stood = {j for j, each in enumerate(signs) if each.photos and each.log_odds > 0 and not fresh[j]}
+    stood = {j for j, each in enumerate(signs) if each.photos and each.alike > 0 and not fresh[j]}
     usual = [each.outline for each in known if each.log_odds > 0 and np.isfinite(each.outline)]
     least = OUTLINED * float(np.median(usual or 1.0))
     return stood, {j for j, each in enumerate(signs) if not each.photos or each.outline < least}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -37,6 +39,21 @@ def test_a_thing_that_stands_there_a_thing_that_is_gone_and_a_hidden_one() -> No
     assert still.log_odds > 3 and gone.log_odds < -3
     hidden = signs_of([shown(2.0, cover=30)], [7], np.zeros(1), np.array([0.1]))[0]
     assert hidden.pixels == 0 and not hidden.seen
+
+
+def test_a_blurred_map_and_rays_that_were_not_measured_say_little_against_a_thing() -> None:
+    """Its outline agrees and its texture does not; one row of its 20 was measured, behind it."""
+    behind = np.zeros(SHAPE)
+    behind[10, 10:40] = 3.0
+    sharp = replace(shown(2.0, same=False), measured=behind)
+    blurred = replace(sharp, rendered=sharp.rendered / 5, product=sharp.product / np.sqrt(5))
+    plain = replace(sharp, **dict.fromkeys(("rendered", "shown", "product"), np.zeros(SHAPE)))
+    seen, unclear, nothing = (signs_of([look], [7], np.ones(1), np.array([0.1]))[0] for look in (sharp, blurred, plain))
+    assert seen.correlation == pytest.approx(0.1) and unclear.correlation == pytest.approx(0.1)
+    assert seen.contrast == pytest.approx(1) and unclear.contrast == pytest.approx(0.2)
+    assert seen.measured == 1 / 20 and seen.through == 1
+    assert seen.log_odds < -3 and unclear.log_odds > 0 and nothing.log_odds > 0
+    assert unclear.alike == pytest.approx(seen.alike)
 
 
 def test_what_stands_in_front_is_not_looked_at() -> None:
