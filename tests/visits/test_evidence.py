@@ -54,6 +54,8 @@ def test_a_blurred_map_and_rays_that_were_not_measured_say_little_against_a_thin
     assert seen.measured == 1 / 20 and seen.through == 1
     assert seen.log_odds < -3 and unclear.log_odds > 0 and nothing.log_odds > 0
     assert unclear.alike == pytest.approx(seen.alike)
+    told = 3 * (1 - 0.6) - 8 * (unclear.colour - 0.12) - 2 * (1 - 0.2) / 20  # by hand, of WEIGHTS
+    assert unclear.log_odds == pytest.approx(told)
 
 
 def test_what_stands_in_front_is_not_looked_at() -> None:
