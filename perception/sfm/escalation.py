@@ -304,13 +304,13 @@ class Escalation:
                 ids = [db.read_image_with_name(name).image_id for name in names]
             left = self._left_out()
             similar = similar_photos(largest_features(store.database, names))
-            again = np.asarray(similar[left].any(axis=0))
-            again[left] = True
+            again = np.zeros(len(names), bool)
+            again[np.concatenate([similar[i] for i in left])] = True
             row = {image: n for n, image in enumerate(ids)}
             pairs = {(row[i], row[j]) for (i, j), found in verified_matches(store.database).items() if len(found)}
             pairs = {pair for pair in pairs if again[list(pair)].any()}
-            possible = similar if len(names) > ALL_PAIRS else np.ones_like(similar)
-            pairs |= {(i, j) for i in left for j in np.flatnonzero(possible[i]).tolist() if i != j}
+            possible = similar if len(names) > ALL_PAIRS else [np.arange(len(names))] * len(names)
+            pairs |= {(i, j) for i in left for j in possible[i].tolist() if i != j}
             chosen = sorted({(min(pair), max(pair)) for pair in pairs})
             with atomic_directory(folder) as new:
                 database, kept = new / store.database.name, [image for image, n in row.items() if not again[n]]

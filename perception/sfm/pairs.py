@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from itertools import combinations
 from pathlib import Path
 
@@ -37,7 +39,7 @@ def select_pairs(database: Path, names: list[str], most: int, progress: Progress
     if count < EXHAUSTIVE_BELOW:
         return list(combinations(range(count), 2))
     descriptors = largest_features(database, names)
-    compared = similar_photos(descriptors) if count > RETRIEVED_ABOVE else np.ones((count, count), bool)
+    compared = similar_photos(descriptors) if count > RETRIEVED_ABOVE else [np.arange(count)] * count
     votes = coarse_votes(descriptors, compared, progress)
     pairs = {(i, j) for i in range(count) for j in range(i + 1, min(i + NEIGHBORS + 1, count))}
     for i in range(count):
@@ -48,50 +50,55 @@ def select_pairs(database: Path, names: list[str], most: int, progress: Progress
     return sorted(pairs)
 
 
-def similar_photos(descriptors: list[np.ndarray]) -> np.ndarray:
-    """[n, n] bool, symmetric: whether one of two photos is among the RETRIEVED most similar of the other.
+def similar_photos(descriptors: list[np.ndarray]) -> list[np.ndarray]:
+    """Of each photo those, ascending and with itself, that are among its RETRIEVED most similar or it among theirs.
 
-    descriptors: unit features [F, 128] of each photo. Similarity is the cosine of two VLADs (Jégou et al., "Aggregating
+    descriptors: those [F, 128] uint8 of each photo. Similarity is the cosine of two VLADs (Jégou et al., "Aggregating
     local descriptors into a compact image representation", CVPR 2010): sums of the residuals of a photo's features to
     the nearest of WORDS k-means centres, each sum at unit length (Arandjelović and Zisserman, CVPR 2013).
     """
     from scipy.cluster.vq import kmeans2
 
-    every = np.concatenate(descriptors)
-    sample = np.sort(np.random.default_rng(0).permutation(len(every))[: 200 * WORDS])
+    count, end = len(descriptors), np.cumsum([len(each) for each in descriptors])
+    sample = np.sort(np.random.default_rng(0).permutation(end[-1])[: 200 * WORDS])
     if len(sample) < WORDS:
-        return np.ones((len(descriptors), len(descriptors)), bool)
-    centres = kmeans2(every[sample], WORDS, iter=10, minit="points", seed=0)[0].astype(np.float32)
+        return [np.arange(count)] * count
+    parts = np.split(sample, np.searchsorted(sample, end[:-1]))
+    some = [descriptors[i][part - end[i] + len(descriptors[i])] for i, part in enumerate(parts)]
+    centres = kmeans2(unit(np.concatenate(some)), WORDS, iter=10, minit="points", seed=0)[0].astype(np.float32)
     half = 0.5 * (centres**2).sum(axis=1)
-    count = len(descriptors)
     vlads = np.zeros((count, WORDS, 128), np.float32)
     for first in range(0, count, AT_ONCE):
         some = descriptors[first : first + AT_ONCE]
-        features = np.concatenate(some)
+        features = unit(np.concatenate(some))
         nearest = (features @ centres.T - half).argmax(axis=1)
         row = np.repeat(np.arange(len(some)), [len(each) for each in some]) * WORDS + nearest
         entries = (np.ones(len(row), np.float32), (row, np.arange(len(row))))
         sums = sparse.csr_matrix(entries, shape=(len(some) * WORDS, len(row))) @ (features - centres[nearest])
-        vlads[first : first + AT_ONCE] = sums.reshape(-1, WORDS, 128)
-    vlads /= np.maximum(np.linalg.norm(vlads, axis=2, keepdims=True), 1e-9)
+        each = sums.reshape(-1, WORDS, 128)
+        each /= np.maximum(np.linalg.norm(each, axis=2, keepdims=True), 1e-9)
+        vlads[first : first + AT_ONCE] = each
     rows = vlads.reshape(count, -1)
     rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9)
-    similar = np.zeros((count, count), bool)
+    best = np.zeros((count, min(RETRIEVED + 1, count)), np.int32)
     for first in range(0, count, AT_ONCE):
         order = np.argsort(-(rows[first : first + AT_ONCE] @ rows.T), axis=1, kind="stable")
-        np.put_along_axis(similar[first : first + AT_ONCE], order[:, : RETRIEVED + 1], True, axis=1)
-    return similar | similar.T | np.eye(count, dtype=bool)
+        best[first : first + AT_ONCE] = order[:, : RETRIEVED + 1]
+    ends = best.shape[1] * np.arange(count + 1)
+    alike = sparse.csr_matrix((np.ones(best.size, bool), best.ravel(), ends), shape=(count, count))
+    alike = sparse.csr_matrix(alike + alike.T + sparse.eye(count, dtype=bool))
+    alike.sort_indices()
+    return np.split(alike.indices, alike.indptr[1:-1])
 
 
 def largest_features(database: Path, names: list[str]) -> list[np.ndarray]:
-    """Unit descriptors [F, 128] of the COARSE_FEATURES largest features of each photo."""
-    return [unit(data[by_size[:COARSE_FEATURES]]) for _, data, by_size in stored_features(database, names)]
+    """Descriptors [F, 128] uint8 of the COARSE_FEATURES largest features of each photo."""
+    return [data[by_size[:COARSE_FEATURES]] for _, data, by_size in stored_features(database, names)]
 
 
-def stored_features(database: Path, names: list[str]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def stored_features(database: Path, names: list[str]) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Of each photo's features: pixels [F, 2], descriptors [F, 128] uint8, and their order by size, largest first."""
     pycolmap = load_pycolmap()
-    result = []
     with pycolmap.Database.open(database) as db:
         for name in names:
             image = db.read_image_with_name(name)
@@ -99,8 +106,7 @@ def stored_features(database: Path, names: list[str]) -> list[tuple[np.ndarray, 
             keypoints = keypoints if isinstance(keypoints, np.ndarray) else pycolmap.keypoints_to_matrix(keypoints)
             area = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
             data = np.asarray(db.read_descriptors(image.image_id).data)
-            result.append((keypoints[:, :2].astype(np.float64), data, np.argsort(-area, kind="stable")))
-    return result
+            yield keypoints[:, :2].astype(np.float64), data, np.argsort(-area, kind="stable")
 
 
 def unit(descriptors: np.ndarray) -> np.ndarray:
@@ -109,16 +115,17 @@ def unit(descriptors: np.ndarray) -> np.ndarray:
     return np.asarray(data / np.maximum(np.linalg.norm(data, axis=1, keepdims=True), 1e-9))
 
 
-def coarse_votes(descriptors: list[np.ndarray], compared: np.ndarray, progress: Progress) -> sparse.csr_matrix:
-    """[n, n] number of matches of each pair of photos in `compared` [n, n], from unit descriptors [F, 128] of each.
+def coarse_votes(descriptors: list[np.ndarray], compared: list[np.ndarray], progress: Progress) -> sparse.csr_matrix:
+    """[n, n] number of matches of each photo with those of `compared`, from descriptors [F, 128] uint8 of each.
     The columns of each row ascend."""
     count = len(descriptors)
+    of_photo = lru_cache(RETRIEVED_ABOVE)(lambda i: unit(descriptors[i]))
 
     def compare(i: int) -> sparse.csr_matrix:
-        later, found = i + 1 + np.flatnonzero(compared[i, i + 1 :]), list[int]()
+        later, found = compared[i][compared[i] > i], list[int]()
         for chosen in (later[first : first + AT_ONCE] for first in range(0, len(later), AT_ONCE)):
-            others = [descriptors[j] for j in chosen]
-            similarity = descriptors[i] @ np.concatenate(others).T
+            others = [of_photo(j) for j in chosen.tolist()]
+            similarity = of_photo(i) @ np.concatenate(others).T
             blocks = np.split(similarity, np.cumsum([len(other) for other in others])[:-1], axis=1)
             found += [len(mutual_matches(block)) for block in blocks]
         votes = np.array(found, np.int64)
