@@ -11,7 +11,8 @@ past             where it stood before, oldest first: {"until", "centroid", "obb
                  until: the visit before the one that found it to stand there no more, so entries ascend. transform:
                  [4, 4] that takes points from there to where it stood next (the next entry, else today's spot); null
                  where that is not known, as for a removed thing. ambiguous: another motion, or another thing that looks
-                 alike, explains the visit as well. axis: [3] about which its turn is not known, as it looks round.
+                 alike, explains the visit as well, or another turn may show sides of it that no visit saw. axis: [3]
+                 about which its turn is not known, as it looks round.
                  "gone": true: it was away until that visit; it has come back since.
 
 A removed instance stays in instances.json and language.npz, with `num_gaussians` 0 and its last box; the last entry of

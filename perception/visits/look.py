@@ -173,3 +173,15 @@ def projected(view: TrainingView, points: np.ndarray) -> tuple[np.ndarray, np.nd
     local = points @ pose[:3, :3].T + pose[:3, 3]
     z = local[:, 2]
     return local[:, :2] / np.where(np.abs(z) > 1e-6, z, 1e-6)[:, None] * np.diag(K)[:2] + K[:2, 2], z
+
+
+def seen_from(views: Sequence[View], points: np.ndarray) -> np.ndarray:
+    """[V, 3] unit directions from the middle of a thing, points [P, 3], to the cameras of the views that show it."""
+    middle = np.median(points, axis=0)
+    found = []
+    for view in views:
+        local = view.camera_from_world[:3, :3] @ middle + view.camera_from_world[:3, 3]
+        pixel = (view.K @ (local / max(local[2], 1e-9)))[:2]
+        if local[2] > 1e-3 and ((pixel >= 0) & (pixel < (view.width, view.height))).all():
+            found.append(-view.camera_from_world[:3, :3].T @ (local / np.linalg.norm(local)))
+    return np.array(found).reshape(-1, 3)

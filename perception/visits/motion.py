@@ -18,7 +18,7 @@ from perception.gaussians.model import Gaussians
 from perception.gaussians.views import TrainingView, expected_depth, render
 from perception.rasterizer.rasterize import rasterizer_for
 from perception.rasterizer.types import Settings
-from perception.visits.evidence import Signs, signs_from, sums_in
+from perception.visits.evidence import WEIGHTS, Signs, signs_from, sums_in
 from perception.visits.look import Look, blurred, projected
 from perception.visits.registration import BEST, TURNED, YAWS, Points, angle_between, looks_round, register, turns
 
@@ -27,6 +27,8 @@ VISIBLE, TOUCHING = 0.3, 0.02
 SIZES, LEAST_PART = (0.35, 1.6), 0.3
 """Least and largest size of the new thing relative to the old one, which may be half hidden; least share of its points
 that lie within reach of each other, if it is that thing."""
+HALF_HIDDEN = 0.3
+"""Radii of the old thing by which the new one is less high, from which its lower part may be hidden."""
 JUDGED, LARGE, SMALL = 4, 128, 48
 """Photos by which a motion is judged: those that show most of the new thing, from other sides; the long side in pixels
 from which their parts are halved, and from which they are to find a motion at first, when it may be far off."""
@@ -55,6 +57,12 @@ LOOKS = 8.0, 0.45
 things share .5 to .75 between visits, others up to .5."""
 CLOSE = 1.5
 """Log-odds within which two motions, or two look-alikes, cannot be told apart."""
+WITHIN = 0.25
+"""Share of the pixels of a moved thing that may lie just behind the surface of others: things do not go through each
+other. Where they truly stand it is up to .17, of pieces that fit somewhere by chance .3 to .5."""
+SURE, UNLIKE, SIDE = 0.8, WEIGHTS["correlation"][1], 45.0
+"""Correlation with the photos from which a turn is sure, and below which it is not known. Between them other turns must
+be excluded, too: a carton shows the same print on two sides. Degrees between directions that see the same side."""
 PRINT = 7.0
 """Log-odds that a wrong turn of printed things costs at least; the shades of a plain round thing cost up to 6."""
 
@@ -62,8 +70,8 @@ PRINT = 7.0
 @dataclass(frozen=True)
 class Motion:
     """new_from_old [4, 4] of a thing; odds: log-odds that it is the same thing, by the photos and by its colours;
-    ambiguous: another motion explains the photos as well. axis [3]: unit vector about which all turns do, so that the
-    thing looks round and its turn is not known; None for others."""
+    ambiguous: another motion explains the photos as well, or may show sides of it that no visit before saw. axis [3]:
+    unit vector about which all turns do, so that the thing looks round and its turn is not known; None for others."""
 
     new_from_old: np.ndarray
     odds: float
@@ -109,12 +117,10 @@ class Cut:
         images = np.zeros(self.depth.shape, np.int64) if labels is None else labels.numpy().astype(np.int64)
         return images, np.bincount(images.ravel())
 
-    def sums(self, thing: Gaussians, motions: np.ndarray, smallest: float) -> np.ndarray:
-        """[P, 11] of `evidence.sums_in`, of a thing after each of the motions [P, 4, 4] before all else: the nearer of
-        two surfaces is seen. To move the camera the other way is the same as to move the thing. smallest: its least
-        extent."""
+    def _drawn(self, thing: Gaussians, motions: np.ndarray) -> tuple[torch.Tensor, np.ndarray, np.ndarray]:
+        """Of a thing alone after each of the motions [P, 4, 4]: colours [P, h, w, 3], opacities [P, h, w], depths
+        [P, h, w] (infinite where it is not). To move the camera the other way is the same as to move the thing."""
         view, (height, width) = self.view, self.depth.shape
-        photo, gray, mean, variance = self._photo
         cameras = torch.from_numpy((view.camera_from_world.double().numpy() @ motions).astype(np.float32))
         inputs = thing.inputs(view.camera_from_world, view.K, harmonics=True)
         inputs = replace(inputs, viewmats=cameras, Ks=view.K.expand(len(motions), 3, 3).contiguous())
@@ -123,8 +129,22 @@ class Cut:
         assert out.depths is not None  # for the type checker
         alphas = out.alphas.numpy()
         depths = np.where(alphas > VISIBLE, out.depths.numpy() / np.maximum(alphas, 1e-6), np.inf)
+        return out.colors, alphas, depths
+
+    def within(self, thing: Gaussians, motion: np.ndarray, smallest: float) -> np.ndarray:
+        """[2] pixels of a thing after a motion: all, and those behind the surface of all else by less than its least
+        extent `smallest`."""
+        depth = self._drawn(thing, motion[None])[2][0]
+        behind = (depth >= self.depth * (1 + TOUCHING)) & (depth < self.depth * (1 + TOUCHING) + smallest)
+        return np.array([np.isfinite(depth).sum(), (behind & np.isfinite(depth)).sum()])
+
+    def sums(self, thing: Gaussians, motions: np.ndarray, smallest: float) -> np.ndarray:
+        """[P, 11] of `evidence.sums_in`, of a thing after each of the motions [P, 4, 4] before all else: the nearer of
+        two surfaces is seen. smallest: its least extent."""
+        photo, gray, mean, variance = self._photo
+        view, (colors, alphas, depths) = self.view, self._drawn(thing, motions)
         fronts = depths < self.depth * (1 + TOUCHING)
-        own = np.where(fronts[..., None], view.exposed(out.colors).numpy(), 0)
+        own = np.where(fronts[..., None], view.exposed(colors).numpy(), 0)
         images = own + (1 - np.where(fronts, alphas, 0)[..., None]) * self.image
         images = images.clip(0, 1).astype(np.float32)
         mapped = np.where(fronts, depths, np.where(np.isfinite(self.depth), self.depth, 0)).astype(np.float32)
@@ -230,33 +250,47 @@ def _distinct(found: Sequence[Found]) -> list[Found]:
 
 
 def _upright_starts(a: Points, b: Points, up: np.ndarray) -> list[np.ndarray]:
-    """Turns about the vertical that bring box a onto box b, the lowest points onto each other."""
+    """Turns about the vertical that bring box a onto box b, the lowest points onto each other; where b is less high,
+    also the highest ones, as of a thing that is half hidden the upper part shows."""
     poses = []
     for rotation in turns(up, YAWS):
         turned = a.points @ rotation.T
         (low_a, high_a), (low_b, high_b) = (np.quantile(points, [0.03, 0.97], axis=0) for points in (turned, b.points))
         step = (low_b + high_b - low_a - high_a) / 2
-        step += up * ((low_b - low_a - step) @ up)
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation, step
-        poses.append(pose)
+        rises = [(low_b - low_a - step) @ up, (high_b - high_a - step) @ up]
+        for rise in rises if rises[1] - rises[0] < -HALF_HIDDEN * a.radius else rises[:1]:
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = rotation, step + up * rise
+            poses.append(pose)
     return poses
 
 
 def settled(
-    old: Gaussians, found: Sequence[Found], cuts: Sequence[Cut], up: np.ndarray, depth: float, alike: float
-) -> Motion:
-    """The best of the two best motions after refinement, and whether the other explains the photos as well. alike: see
-    `looks_alike`."""
+    old: Gaussians,
+    found: Sequence[Found],
+    cuts: Sequence[Cut],
+    up: np.ndarray,
+    depth: float,
+    alike: float,
+    seen: np.ndarray,
+) -> Motion | None:
+    """The best of the two best motions after refinement, and whether the other explains the photos as well; None where
+    much of the thing would lie within others. alike: see `looks_alike`; seen: see `look.seen_from`."""
     likely = [each for each in found[:2] if each[0].same > found[0][0].same - BEHIND]
     refine = _distinct([refined(old, each, cuts, depth, STEP, LEAST_STEP) for each in likely])
     (signs, pose), others = refine[0], refine[1:]
+    shown, within = np.sum([cut.within(old, pose, depth) for cut in cuts], axis=0)
+    if within > WITHIN * shown:
+        return None
     axis = round_about(old, refine[0], cuts, up, depth)
     if axis is not None:  # motions that differ by a turn about it are no others
         own = pose[:3, :3].T @ axis
         others = [other for other in others if (other[1][:3, :3] @ own) @ axis < np.cos(np.radians(TURNED))]
+    ambiguous = any(other.same > signs.same - CLOSE for other, _ in others)
+    if axis is None and not ambiguous and signs.correlation < SURE:
+        ambiguous = signs.correlation < UNLIKE or other_sides(old, pose, cuts, up, depth, seen)
     odds = signs.same + LOOKS[0] * (alike - LOOKS[1])
-    return Motion(pose, odds, any(other.same > signs.same - CLOSE for other, _ in others), axis)
+    return Motion(pose, odds, ambiguous, axis)
 
 
 def round_about(old: Gaussians, motion: Found, cuts: Sequence[Cut], up: np.ndarray, depth: float) -> np.ndarray | None:
@@ -272,6 +306,24 @@ def round_about(old: Gaussians, motion: Found, cuts: Sequence[Cut], up: np.ndarr
             if min(each.same for each, _ in turned) > signs.same - PRINT:
                 return np.asarray(after)
     return None
+
+
+def other_sides(
+    old: Gaussians, pose: np.ndarray, cuts: Sequence[Cut], up: np.ndarray, depth: float, seen: np.ndarray
+) -> bool:
+    """Whether after another turn about the vertical photos would show sides of a moved thing that no visit before saw,
+    while the other photos do not contradict it. seen: see `look.seen_from`."""
+    middle = pose[:3, :3] @ np.median(Points.of(old).points, axis=0) + pose[:3, 3]
+    rays = np.stack([_centre(cut.view) - middle for cut in cuts])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    motions = np.stack([_about(turn, middle) @ pose for turn in turns(up, YAWS)])
+    sums = np.stack([cut.sums(old, motions, depth) for cut in cuts], axis=1)
+    for rows, motion in zip(sums[1:], motions[1:], strict=True):
+        known = (rays @ motion[:3, :3] @ seen.T).max(axis=1, initial=-1) > np.cos(np.radians(SIDE))
+        own, other = (signs_from(each[known].sum(axis=0), 1.0).same for each in (sums[0], rows))
+        if not known.all() and other > own - CLOSE:
+            return True
+    return False
 
 
 def _about(rotation: np.ndarray, middle: np.ndarray) -> np.ndarray:

@@ -171,7 +171,7 @@ def _moved(
     depth = {entry["id"]: min(entry["obb"]["extent"]) for entry in visit.gmap.instances}
     gravity = visit.gmap.info.get("gravity")
     up = np.array(UP) if gravity is None else -np.array(gravity["direction"], np.float64)
-    frames = visit.frames
+    frames, seen = visit.frames, {i: visit.seen_from(i) for i in gone}
     odds, motions = np.full((len(gone), len(things)), -np.inf), dict[tuple[int, int], Motion]()
     for j, (own, _) in enumerate(things):
         new = grown.rows(torch.from_numpy(own))
@@ -184,8 +184,9 @@ def _moved(
             found, cuts = motions_of(olds[gone[a]], new, frames, rest, up, depth[gone[a]])
             if not found or found[0][0].same + LOOKS[0] * (alike[a] - LOOKS[1]) < HOPELESS:
                 continue
-            motion = settled(olds[gone[a]], found, cuts, up, depth[gone[a]], alike[a])
-            odds[a, j], motions[a, j] = motion.odds, motion
+            motion = settled(olds[gone[a]], found, cuts, up, depth[gone[a]], alike[a], seen[gone[a]])
+            if motion is not None:
+                odds[a, j], motions[a, j] = motion.odds, motion
         visit.run.progress.update("motions", j + 1, len(things))
     pairs = {}
     for a, j in assigned(odds, MOVED):

@@ -13,12 +13,23 @@ import torch
 from perception.gaussians.model import Gaussians
 from perception.gaussians.photos import split_scene
 from perception.gaussians.views import TrainingView
+from perception.map.history import since
 from perception.map.map import Map
 from perception.masks import MaskSource
 from perception.masks.stereo import StereoView
 from perception.pipeline.checkpoint import digest, training_mark
 from perception.pipeline.optimise import Photos, Run, label_photos
-from perception.visits.look import Look, compared, depth_at, in_light, in_view, look, stereo_of, with_exposure
+from perception.visits.look import (
+    Look,
+    compared,
+    depth_at,
+    in_light,
+    in_view,
+    look,
+    seen_from,
+    stereo_of,
+    with_exposure,
+)
 from perception.visits.registration import compact
 from perception.visits.scene import foreign_photos, refuse_older, visit_scene
 
@@ -62,17 +73,21 @@ class Visit:
         """These Gaussians, in the light of the visit."""
         return in_light(gaussians_of(self.gmap, self.rows_of(instance)), self.light)
 
+    def seen_from(self, instance: int) -> np.ndarray:
+        """[V, 3] directions to an instance where it stands from the map's views since it stands there, see `look`."""
+        entry = next(entry for entry in self.gmap.instances if entry["id"] == instance)
+        views = [view for view in self.gmap.views if getattr(view, "visit", 0) >= since(entry)]
+        return seen_from(views, self.thing(instance).means.double().numpy())
+
     @property
     def frames(self) -> list[tuple[TrainingView, np.ndarray]]:
-        """The training photos at full size, and what was measured in them."""
-        pairs = zip(self.photos.views, self.stereo, strict=True)
+        """The training photos at the size at which they are compared, and what was measured in them."""
+        pairs = zip(map(compared, self.photos.views), self.stereo, strict=True)
         return [(view, depth_at(stereo, view.photo.shape)) for view, stereo in pairs]
 
     def looks(self, gaussians: Gaussians, ids: np.ndarray) -> list[Look]:
         """The training photos beside the Gaussians with instances ids [N]."""
-        small = map(compared, self.photos.views)
-        pairs = zip(small, self.stereo, strict=True)
-        return [look(gaussians, ids, view, depth_at(stereo, view.photo.shape)) for view, stereo in pairs]
+        return [look(gaussians, ids, view, measured) for view, measured in self.frames]
 
 
 def open_visit(run: Run, gmap: Map, source: MaskSource, output: Path) -> Visit:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from itertools import permutations
+from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
 from perception.gaussians.model import Gaussians, isotropic
 from perception.gaussians.views import TrainingView, render
 from perception.instances.group import Grouping
-from perception.visits.motion import Cut, assigned, judged, refined
+from perception.types import View
+from perception.visits.look import seen_from
+from perception.visits.motion import Cut, _upright_starts, assigned, judged, other_sides, refined
 from perception.visits.registration import Points, angle_between, carried, compact, looks_round, register
 from perception.visits.today import _without_fragments
 from support.aimed import look_at
@@ -86,15 +92,16 @@ def test_a_carried_thing_looks_as_the_thing_does_from_the_carried_camera() -> No
     assert np.quantile(np.abs(before - after), 0.99) < 2e-3
 
 
-def test_a_motion_is_refined_to_the_one_that_the_photos_show() -> None:
-    """Photos are renders of the moved thing, so the motion is known; the search starts 9° and 2 cm off."""
-    rng = np.random.default_rng(4)
-    generator = torch.Generator().manual_seed(1)
+def speckled(rng: np.random.Generator, generator: torch.Generator) -> Gaussians:
+    """Of the box of `thing`, each of its own colour."""
     points, colors = thing(rng, 500).points, torch.rand(500, 3, generator=generator)
-    gaussians = isotropic(points, torch.full((500,), -4.6), colors, 0.9, 2, generator)
-    true = motion(40.0, (0.1, 0.05, 0.0))
+    return isotropic(points, torch.full((500,), -4.6), colors, 0.9, 2, generator)
+
+
+def photographed(gaussians: Gaussians, true: np.ndarray, eyes: Sequence[tuple[float, float, float]]) -> list[Cut]:
+    """Photos of a thing after the motion `true`, from cameras at `eyes` that look where it went; nothing else is."""
     K, cuts = torch.tensor([[110.0, 0, 32], [0, 110, 32], [0, 0, 1]]), []
-    for eye in ((0.6, 0.1, 0.4), (-0.3, 0.5, 0.4), (0.0, -0.5, 0.6)):
+    for eye in eyes:
         camera = torch.from_numpy(look_at(np.array(eye), true[:3, 3], UP).astype(np.float32))
         out = render(carried(gaussians, true), camera, K, 64, 64, harmonics=True)
         photo = (out.colors[0].clamp(0, 1) * 255).to(torch.uint8)
@@ -102,10 +109,76 @@ def test_a_motion_is_refined_to_the_one_that_the_photos_show() -> None:
         view = TrainingView("a", photo, labels, K, camera)
         empty = np.zeros((64, 64), np.float32)
         cuts.append(Cut(view, empty, np.zeros((64, 64, 3), np.float32), np.full((64, 64), np.inf)))
+    return cuts
+
+
+def test_a_motion_is_refined_to_the_one_that_the_photos_show() -> None:
+    """Photos are renders of the moved thing, so the motion is known; the search starts 9° and 2 cm off."""
+    rng = np.random.default_rng(4)
+    generator = torch.Generator().manual_seed(1)
+    gaussians = speckled(rng, generator)
+    true = motion(40.0, (0.1, 0.05, 0.0))
+    cuts = photographed(gaussians, true, ((0.6, 0.1, 0.4), (-0.3, 0.5, 0.4), (0.0, -0.5, 0.6)))
     start = motion(49.0, (0.12, 0.05, 0.0))
     found = refined(gaussians, judged(gaussians, [start], cuts, 0.06)[0], cuts, 0.06, 0.1, 0.03)
     assert found[0].same > judged(gaussians, [start], cuts, 0.06)[0][0].same + 1
     assert angle_between(found[1], true) < 2 and np.linalg.norm((found[1] - true)[:3, 3]) < 0.003
+
+
+def test_another_turn_is_excluded_only_where_the_sides_that_it_would_show_were_seen() -> None:
+    """Two photos from +x. Of a box seen all around, no other turn is possible; of one seen from +x, or from +x and -x,
+    the turns that show the sides between. Where one of two photos would show a side that was not seen, but the other
+    one that was, that one excludes the turn."""
+    generator = torch.Generator().manual_seed(1)
+    gaussians = speckled(np.random.default_rng(4), generator)
+    around = np.array([[np.cos(a), np.sin(a), 0.0] for a in np.radians(np.arange(0, 360, 30))])
+    cuts = photographed(gaussians, np.eye(4), ((0.6, 0.1, 0.1), (0.6, -0.1, 0.1)))
+    for seen, unknown in ((around, False), (around[:1], True), (around[[0, 6]], True), (np.zeros((0, 3)), True)):
+        assert other_sides(gaussians, np.eye(4), cuts, UP, 0.06, seen) is unknown
+    both = photographed(gaussians, np.eye(4), ((0.6, 0.1, 0.1), (-0.6, 0.1, 0.1)))
+    front_and_back = around[[0, 1, 2, 10, 11, 6]]
+    assert not other_sides(gaussians, np.eye(4), both, UP, 0.06, front_and_back)
+
+
+def test_the_pixels_of_a_thing_within_others_are_those_less_than_its_extent_behind_them() -> None:
+    generator = torch.Generator().manual_seed(1)
+    gaussians = speckled(np.random.default_rng(4), generator)
+    (cut,) = photographed(gaussians, np.eye(4), ((0.6, 0.0, 0.0),))
+    front = 0.5  # its nearest side, of the camera at .6
+    for depth, share in ((front - 0.03, 1.0), (front - 0.2, 0.0), (front + 0.2, 0.0)):
+        shown, within = replace(cut, depth=np.full((64, 64), depth)).within(gaussians, np.eye(4), 0.06)
+        assert shown > 300 and abs(within / shown - share) < 0.02
+    halved = np.where(np.arange(64) < 32, front - 0.03, np.inf) * np.ones((64, 1))
+    shown, within = replace(cut, depth=halved).within(gaussians, np.eye(4), 0.06)
+    assert abs(within / shown - 0.5) < 0.05
+
+
+def test_a_thing_of_which_the_lower_half_is_hidden_starts_with_its_top_in_place() -> None:
+    rng = np.random.default_rng(6)
+    old, true = thing(rng), motion(60.0, (0.3, -0.1, 0.02))
+    points = old.points @ true[:3, :3].T + true[:3, 3]
+    upper = points[:, 2] > np.median(points[:, 2]) + 0.005
+    for new, lowest in ((points, 12), (points[upper], 24)):
+        starts = _upright_starts(old, Points(new, np.zeros_like(new)), UP)
+        assert len(starts) == lowest
+        near = min(starts, key=lambda pose: angle_between(pose, true) + 100 * abs((pose - true)[2, 3]))
+        assert angle_between(near, true) < 1 and abs((near - true)[2, 3]) < 0.003
+
+
+def test_directions_are_to_the_cameras_that_have_a_thing_in_their_picture() -> None:
+    K, points = np.array([[100.0, 0, 50], [0, 100.0, 40], [0, 0, 1]]), np.array([[1.0, 2, 0], [1.2, 2, 0], [0.8, 2, 0]])
+
+    def view(eye: tuple[float, float, float], at: tuple[float, float, float]) -> View:
+        return View("a", Path("a"), K, 100, 80, look_at(np.array(eye), np.array(at), UP))
+
+    views = [
+        view((3, 2, 0), (1, 2, 0)),
+        view((1, 2, -4), (1, 2.5, 0)),
+        view((3, 2, 0), (5, 2, 0)),
+        view((1, 0, 0), (3, 2, 0)),
+    ]
+    assert seen_from(views, points) == pytest.approx(np.array([[1.0, 0, 0], [0, 0, -1]]), abs=1e-12)
+    assert seen_from([], points).shape == (0, 3)
 
 
 def test_round_things_are_told_from_those_with_a_handle_and_those_with_a_stripe() -> None:
