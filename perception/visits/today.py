@@ -37,7 +37,7 @@ from perception.visits.motion import (
     motions_of,
     settled,
 )
-from perception.visits.registration import carried, looks_alike
+from perception.visits.registration import REACH, Points, carried, looks_alike
 from perception.visits.visit import Visit, gaussians_of
 
 UP = (0.0, 0.0, 1.0)
@@ -110,6 +110,8 @@ def seen_today(visit: Visit) -> Today:
         things, old = [things[j] for j in stands], {n for n, j in enumerate(stands) if j in old}
     with run.stage("motion"):
         pairs = _moved(visit, grown, things, gone)
+    whole = {j: carried(visit.thing(i), motion.new_from_old) for i, (j, motion) in pairs.items()}
+    things = _apart(things, grown.means.double().numpy(), whole, run.config.instances.min_cluster_size)
     return _settled(visit, grown, kept, ids, made, free, signs, gone, things, old, pairs, record)
 
 
@@ -194,6 +196,21 @@ def _moved(
         unsure = rivals.max(initial=-np.inf) > odds[a, j] - CLOSE
         pairs[gone[a]] = (j, replace(motions[a, j], ambiguous=motions[a, j].ambiguous or bool(unsure)))
     return pairs
+
+
+def _apart(
+    things: list[tuple[np.ndarray, float]], means: np.ndarray, whole: dict[int, Gaussians], least: int
+) -> list[tuple[np.ndarray, float]]:
+    """The things; of those that are moved ones, as these stand now (`whole`, by number), what is out of their reach is
+    a thing of its own, as masks may join two. means [N, 3] of all Gaussians; least: of a thing."""
+    result = list(things)
+    for j, gaussians in whole.items():
+        (rows, score), points = things[j], Points.of(gaussians)
+        far = np.linalg.norm(means[rows] - np.median(points.points, axis=0), axis=1) > REACH * points.radius
+        if far.sum() >= least:
+            result[j] = rows[~far], score
+            result.append((rows[far], score))
+    return result
 
 
 def _settled(

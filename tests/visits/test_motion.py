@@ -19,7 +19,7 @@ from perception.types import View
 from perception.visits.look import seen_from
 from perception.visits.motion import Cut, _upright_starts, assigned, judged, other_sides, refined
 from perception.visits.registration import Points, angle_between, carried, compact, looks_round, register
-from perception.visits.today import _without_fragments
+from perception.visits.today import _apart, _without_fragments
 from support.aimed import look_at
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -202,6 +202,21 @@ def test_pairs_have_the_largest_sum_of_log_odds() -> None:
         best = max(sum(max(0.0, odds[i, j] - 1) for i, j in enumerate(order)) for order in permutations(range(4)))
         pairs = assigned(odds, 1.0)
         assert np.isclose(sum(odds[i, j] - 1 for i, j in pairs), best) and all(odds[i, j] > 1 for i, j in pairs)
+
+
+def test_what_is_out_of_reach_of_a_moved_thing_is_a_thing_of_its_own() -> None:
+    generator = torch.Generator().manual_seed(1)
+    gaussians = speckled(np.random.default_rng(4), generator)
+    own = gaussians.means.double().numpy()
+    other, few = own + np.array([0.5, 0, 0]), own[:5] + np.array([0, 0.7, 0])
+    means = np.concatenate([own, other, few])
+    rows = np.arange(len(own)), np.arange(len(own), 2 * len(own)), np.arange(2 * len(own), len(means))
+    joined, plain = (np.concatenate([rows[0], rows[1]]), 0.5), (rows[0], 0.9)
+    apart = _apart([plain, joined], means, {1: gaussians}, 10)
+    assert [each.tolist() for each, _ in apart] == [each.tolist() for each in (rows[0], rows[0], rows[1])]
+    assert [score for _, score in apart] == [0.9, 0.5, 0.5]
+    stray = (np.concatenate([rows[0], rows[2]]), 0.5)  # too few for a thing: they go with the moved one
+    assert _apart([plain, stray], means, {1: gaussians}, 10) == [plain, stray]
 
 
 def test_small_groups_in_hardly_any_mask_are_no_things() -> None:
