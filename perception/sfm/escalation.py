@@ -305,7 +305,8 @@ class Escalation:
             left = self._left_out()
             similar = similar_photos(largest_features(store.database, names))
             again = np.zeros(len(names), bool)
-            again[np.concatenate([similar[i] for i in left])] = True
+            for i in left:
+                again[similar[i]] = True
             row = {image: n for n, image in enumerate(ids)}
             pairs = {(row[i], row[j]) for (i, j), found in verified_matches(store.database).items() if len(found)}
             pairs = {pair for pair in pairs if again[list(pair)].any()}
