@@ -62,8 +62,7 @@ class Signs:
     def log_odds(self) -> float:
         """Of the thing standing where it stood, positive for yes: `alike`, but for what a blurred map and rays that
         were not measured cannot say."""
-        sharp = float(np.clip((self.contrast - BLURRED[0]) / (BLURRED[1] - BLURRED[0]), 0, 1))
-        told = self._told
+        told, sharp = self._told, float(sharpness(np.array(self.contrast)))
         against = min(0.0, told["correlation"])
         return sum(told.values()) - (1 - sharp) * against - (1 - self.measured) * told["through"]
 
@@ -90,6 +89,27 @@ class Signs:
     def seen(self) -> bool:
         """Whether the visit saw enough of it to judge."""
         return self.photos > 0 and self.share >= UNSEEN
+
+
+def sharpness(contrast: np.ndarray) -> np.ndarray:
+    """In [0, 1]: how much a low correlation says, see BLURRED."""
+    return np.asarray(np.clip((contrast - BLURRED[0]) / (BLURRED[1] - BLURRED[0]), 0, 1))
+
+
+def mask_odds(shown: Look) -> tuple[np.ndarray, np.ndarray]:
+    """[L] log-odds that the map shows what is in each mask of a photo, by correlation and colour, and the same where a
+    blurred map counts as little as in `Signs.log_odds`. Infinite for 0, which is no mask, and for small ones."""
+    labels = shown.labels.ravel()
+    areas = np.bincount(labels)
+    images = (shown.product, shown.rendered, shown.shown, shown.colour)
+    product, a, b, colour = (np.bincount(labels, image.ravel().astype(np.float64)) for image in images)
+    known = product / np.maximum(np.sqrt(a * b), 1e-9)
+    (slope, middle), (per_colour, usual) = WEIGHTS["correlation"], WEIGHTS["colour"]
+    told, by_colour = slope * (known - middle), per_colour * (colour / np.maximum(areas, 1) - usual)
+    sharp = np.where(told < 0, sharpness(a / np.maximum(b, 1e-12)), 1)
+    odds = np.where(areas >= LEAST_PIXELS, by_colour + np.stack([told, sharp * told]), np.inf)
+    odds[:, 0] = np.inf
+    return odds[0], odds[1]
 
 
 def probability(log_odds: float) -> float:

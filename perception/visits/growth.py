@@ -10,7 +10,7 @@ import torch
 
 from perception.config import MapConfig
 from perception.gaussians.depth_start import start_on_surface
-from perception.gaussians.model import Gaussians
+from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.state import USUAL_PHOTOS, TrainRecord, sized
 from perception.gaussians.train import Trainer
 from perception.instances.assign import LEAST_AGREEMENT, affinities, mask_shares
@@ -18,14 +18,17 @@ from perception.instances.group import Grouping, group
 from perception.masks.votes import MaskVotes
 from perception.pipeline.checkpoint import TrainingObserver
 from perception.pipeline.optimise import Photos, Run
-from perception.visits.evidence import AGREE, LEAST_PIXELS, WEIGHTS
-from perception.visits.look import DIFFERENT, Look, correlation
+from perception.visits.carving import carved_surface
+from perception.visits.evidence import AGREE, mask_odds
+from perception.visits.look import DIFFERENT, Look
 
 GROWING, SETTLING = 0.16, 0.1
 """Iterations of the two legs of an update, relative to those of a new map."""
 LEAST_ITERATIONS = 100
 SHIFTED = 0.01
 """Relative difference of depth from which a pixel of a mask that the map does not explain shows a new surface."""
+APART = 2.0
+"""Spacings of carved points from which one is not of a measured surface."""
 SPARE = 3
 """Gaussians that may grow in an update, relative to those that it starts from."""
 
@@ -34,32 +37,34 @@ def changed_pixels(shown: Look) -> np.ndarray:
     """[h, w] bool: pixels whose surface the map lacks: where it shows none, and where the masks that it does not
     explain have another depth or colour than it."""
     changed = shown.mapped == 0
-    labels, areas = shown.labels, np.bincount(shown.labels.ravel())
-    sums = [np.bincount(labels.ravel(), image.ravel().astype(np.float64)) for image in (shown.product, shown.rendered)]
-    sums += [np.bincount(labels.ravel(), image.ravel().astype(np.float64)) for image in (shown.shown, shown.colour)]
-    (slope, middle), (per_colour, usual) = WEIGHTS["correlation"], WEIGHTS["colour"]
-    foreign = np.zeros(len(areas), bool)
-    for label in np.flatnonzero(areas >= LEAST_PIXELS):
-        product, a, b, colour = (total[label] for total in sums)
-        odds = slope * (correlation(product, a, b) - middle) + per_colour * (colour / areas[label] - usual)
-        foreign[label] = odds < 0
-    foreign[0] = False
+    foreign = mask_odds(shown)[0] < 0
     off = np.abs(shown.measured / np.maximum(shown.mapped, 1e-6) - 1) > SHIFTED
     local = shown.product < 0.3 * np.sqrt(np.maximum(shown.rendered * shown.shown, 0))
     unlike = (shown.colour > DIFFERENT) & local & (np.abs(shown.measured / np.maximum(shown.mapped, 1e-6) - 1) > AGREE)
-    return np.asarray(changed | (foreign[labels] & (off | (shown.colour > DIFFERENT))) | unlike)
+    return np.asarray(changed | (foreign[shown.labels] & (off | (shown.colour > DIFFERENT))) | unlike)
 
 
 def new_surface(looks: Sequence[Look], like: Gaussians, budget: int, seed: int) -> Gaussians:
-    """Gaussians on the measured surface of all changed pixels; none where nothing has changed. like: of the map."""
-    views = []
-    for shown in looks:
-        depth = np.where(changed_pixels(shown), shown.measured, 0).astype(np.float32)
+    """Gaussians on the surface of all changed pixels, measured or else carved; none where nothing changed. like: of the
+    map."""
+    from scipy.spatial import cKDTree
+
+    views, changed = [], [changed_pixels(shown) for shown in looks]
+    for shown, pixels in zip(looks, changed, strict=True):
+        depth = np.where(pixels, shown.measured, 0).astype(np.float32)
         views.append(replace(shown.view, depth=torch.from_numpy(depth)))
-    none = np.zeros((0, 3))
-    made = start_on_surface(views, none, none.astype(np.uint8), budget, like.features.shape[1], seed)
-    if made is None:
+    none, size = np.zeros((0, 3)), like.features.shape[1]
+    measured = start_on_surface(views, none, none.astype(np.uint8), budget, size, seed)
+    parts = [] if measured is None else [measured]
+    carved = carved_surface(looks, changed)
+    away = np.ones(len(carved.points), bool)
+    if measured is not None:
+        away = cKDTree(measured.means.numpy()).query(carved.points)[0] > APART * carved.side
+    if away.any():
+        parts.append(from_points(carved.points[away], carved.colors[away], feature_dim=size, seed=seed))
+    if not parts:
         return like.rows(torch.zeros(0, dtype=torch.long))
+    made = Gaussians.concatenate(parts)
     more = made.sh.new_zeros(len(made), like.sh.shape[1] - 1, 3)
     return replace(made, sh=torch.cat([made.sh, more], dim=1))
 
@@ -104,10 +109,10 @@ def joined_instances(votes: MaskVotes, ids: np.ndarray, rows: np.ndarray) -> np.
 
 
 def grouped(gaussians: Gaussians, votes: MaskVotes, rows: np.ndarray, config: MapConfig) -> Grouping:
-    """Instances of the Gaussians `rows`, from their features and the masks."""
+    """Instances of the Gaussians `rows`, from where they lie and the masks: their features were trained too shortly to
+    tell things apart, and join a speaker with a chair that stands a metre beside it."""
     part = gaussians.rows(torch.from_numpy(rows))
     own = MaskVotes(votes.pixels[rows], votes.void[rows], votes.view, votes.area, votes.label)
-    tensors = (part.means, part.scales, part.opacities, part.features)
-    means, scales, opacities, features = (tensor.numpy() for tensor in tensors)
-    arrays, margin = (means, scales, opacities, features), config.losses.margin
-    return group(*arrays, own, config.instances, margin=margin, seed=config.seed, whole=False)
+    means, scales, opacities = (tensor.numpy() for tensor in (part.means, part.scales, part.opacities))
+    none = np.zeros((len(rows), 1), np.float32)
+    return group(means, scales, opacities, none, own, config.instances, seed=config.seed, whole=False)

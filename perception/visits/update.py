@@ -138,6 +138,9 @@ def assembled(visit: Visit, today: Today, described: DescribedInstances, output:
         entry = recorded(entry, number, signs, motion, entry["id"] in today.gone)
         if not is_removed(entry) and (motion is not None or len(rows) != entry["num_gaussians"]):
             entry = with_geometry(entry, gaussians, rows)
+            owned = [(part, np.flatnonzero(today.part_ids == part["id"])) for part in entry.get("parts", ())]
+            if owned:
+                entry = {**entry, "parts": [with_geometry(part, gaussians, own) for part, own in owned if len(own)]}
         instances.append(entry)
     for i, entry in zip(today.added, described.instances, strict=True):
         known = today.added[i][1]

@@ -1,0 +1,160 @@
+"""The surface of new things that stereo does not measure, from their outlines in several photos.
+
+Stereo asks for two photos from similar directions. Of a dozen photos around a room few are, and a ball or a mug may
+have no measured pixel, though three photos show it. Along the rays of its mask in one photo, a point may be on it where
+the other photos that see so far show something new, too (space carving, Kutulakos & Seitz 2000), and its surface is
+where their colours agree best, if they do better than at the map's surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from perception.gaussians.depth_start import DepthCloud
+from perception.gaussians.views import unprojected
+from perception.geometry import sums_by
+from perception.masks.surface import voxel_keys
+from perception.visits.evidence import AGREE, LEAST_PIXELS, mask_odds
+from perception.visits.look import Look, projected
+
+RAYS, STEPS, FINER, NEAREST = 300, 64, 9, 0.3
+"""Rays of a mask; points on each, evenly in inverse depth, from the map's surface to NEAREST of its depth; points
+around the best one of them."""
+UNMEASURED, CHANGED = 0.5, 0.5
+"""Share of the changed pixels of a mask that stereo did not measure, and of its pixels that changed, from which its
+rays are searched."""
+OTHERS = 16
+"""Most other photos by which the rays of a mask are judged."""
+LEAST_SUPPORT, LEAST_ANGLE, AGAINST = 2, 10.0, 0.2
+"""Other photos that must show something new at a point, one of them from a direction so many degrees apart; share of
+those that see so far which may show what the map does: masks have errors."""
+FOUND = 0.3
+"""Share of the rays of a mask with such a point, below which it is an error or a shadow."""
+BLUR, UNLIKE = 1.5, 0.3
+"""Standard deviation in pixels of the window in which colours are compared; a difference counts up to UNLIKE, of 1."""
+PER_AGAINST, PER_SUPPORT, MANY = 0.1, 0.02, 6
+"""Difference of colour that all photos against a point are worth, and one that supports it, up to MANY."""
+FOOTPRINT = 2.0
+"""Distance between the points that are returned, in pixels."""
+
+
+@dataclass(frozen=True)
+class _Photo:
+    """A look with the pixels that changed [h, w] bool, its smoothed colours [h, w, 3] in [0, 1] and its centre [3]."""
+
+    look: Look
+    changed: np.ndarray
+    colors: np.ndarray
+    centre: np.ndarray
+
+
+def carved_surface(looks: Sequence[Look], changed: Sequence[np.ndarray]) -> DepthCloud:
+    """Points on new things. changed: pixels [h, w] bool of each look whose surface the map lacks."""
+    photos = [_photo(*pair) for pair in zip(looks, changed, strict=True)]
+    parts = [_on_rays(photo, label, photos) for photo in photos for label in _unmeasured_masks(photo)]
+    parts = [part for part in parts if len(part)]
+    if not parts:
+        return DepthCloud(0.0, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    rows = np.concatenate(parts)
+    side = FOOTPRINT * float(np.median(rows[:, 6]))
+    _, voxel, count = np.unique(voxel_keys(rows[:, :3], side), return_inverse=True, return_counts=True)
+    means = sums_by(voxel.reshape(-1), rows[:, :6], len(count)) / count[:, None]
+    return DepthCloud(side, means[:, :3], np.rint(255 * means[:, 3:].clip(0, 1)).astype(np.uint8))
+
+
+def _photo(look: Look, changed: np.ndarray) -> _Photo:
+    pose = look.view.camera_from_world.double().numpy()
+    colors = cv2.GaussianBlur(look.view.photo.numpy().astype(np.float32) / 255, (0, 0), BLUR)
+    return _Photo(look, changed & (look.mapped > 0), np.asarray(colors), -pose[:3, :3].T @ pose[:3, 3])
+
+
+def _unmeasured_masks(photo: _Photo) -> list[int]:
+    """The masks that are mostly new, also where the map is too blurred to tell, and mostly not measured."""
+    labels = photo.look.labels
+    areas = np.bincount(labels.ravel())
+    new = np.bincount(labels[photo.changed], minlength=len(areas))
+    bare = np.bincount(labels[photo.changed & (photo.look.measured == 0)], minlength=len(areas))
+    chosen = (new >= LEAST_PIXELS) & (bare > UNMEASURED * new) & (new > CHANGED * areas)
+    return np.flatnonzero(chosen & (mask_odds(photo.look)[1] < 0)).tolist()
+
+
+def _on_rays(photo: _Photo, label: int, photos: Sequence[_Photo]) -> np.ndarray:
+    """[R, 7] point, colour and pixel footprint on rays of a mask; of none, where few of them have such a point."""
+    look = photo.look
+    row, column = np.nonzero(photo.changed & (look.labels == label))
+    thin = slice(None, None, max(1, len(row) // RAYS))
+    row, column = row[thin], column[thin]
+    each, own = np.arange(len(row)), photo.colors[row, column]
+    K, pose = look.view.K.double().numpy(), look.view.camera_from_world.double().numpy()
+
+    def swept(nearer: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Points [S, R, 3] and depths, costs and differences [S, R] at 0 (on the map's surface) to 1 (NEAREST)."""
+        z = look.mapped[row, column] / (1 + nearer * (1 / NEAREST - 1))
+        x, y = (np.broadcast_to(at + 0.5, z.shape).ravel() for at in (column, row))
+        points = unprojected(K, pose, x, y, z.ravel())
+        others = _others(photo, points[len(row) // 2 :: len(row)], photos)
+        judged = _judged(points, np.tile(own, (len(z), 1)), photo, others)
+        return points.reshape(*z.shape, 3), z, *(values.reshape(z.shape) for values in judged)
+
+    nearer = np.repeat(np.linspace(0, 1, STEPS)[:, None], len(row), axis=1)
+    _, _, cost, _, flat = swept(nearer)
+    between = np.linspace(-1, 1, FINER)[:, None] / (STEPS - 1)
+    points, z, cost, difference, _ = swept(nearer[cost.argmin(axis=0), each] + between)
+    best = cost.argmin(axis=0), each
+    found = np.isfinite(cost[best]) & (difference[best] < flat[0])
+    if found.mean() < FOUND:
+        return np.zeros((0, 7))
+    return np.column_stack([points[best], own, z[best] / K[0, 0]])[found]
+
+
+def _others(photo: _Photo, ray: np.ndarray, photos: Sequence[_Photo]) -> list[_Photo]:
+    """The OTHERS photos in which most of the points [S, 3] of a ray lie."""
+    counts = []
+    for other in photos:
+        (pixel, z), size = projected(other.look.view, ray), other.look.mapped.shape[::-1]
+        counts.append(((z > 1e-3) & ((pixel >= 0) & (pixel < size)).all(axis=1)).sum() if other is not photo else 0)
+    order = np.argsort(counts, kind="stable")[::-1][:OTHERS]
+    return [photos[n] for n in order.tolist() if counts[n] > 0]
+
+
+def _judged(
+    points: np.ndarray, colors: np.ndarray, photo: _Photo, others: Sequence[_Photo]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of points on rays of a photo, with its colours there [P, 3], each [P]: what counts against them, infinite where
+    they are on no new thing; mean difference of colour to the LEAST_SUPPORT photos likest there;
+    the same to those in which they lie on the map's surface, infinite where there are none."""
+    support, against, apart, near, flat = np.zeros((5, len(points)))
+    best = np.full((LEAST_SUPPORT, len(points)), UNLIKE)  # other photos see other sides of it
+    rays = _unit(points - photo.centre)
+    for other in others:
+        look, (pixel, z) = other.look, projected(other.look.view, points)
+        column, row = np.floor(pixel).astype(np.int64).T
+        height, width = look.mapped.shape
+        at = np.flatnonzero((z > 1e-3) & (column >= 0) & (row >= 0) & (column < width) & (row < height))
+        row, column, z = row[at], column[at], z[at]
+        mapped, measured = look.mapped[row, column], look.measured[row, column]
+        reached = (mapped > 0) & (z < mapped * (1 - AGREE / 2)) & ~((measured > 0) & (measured < z * (1 - AGREE)))
+        shows = reached & other.changed[row, column] & ~(measured > z * (1 + AGREE))
+        support[at] += shows
+        against[at] += reached & ~shows
+        unlike = np.minimum(np.abs(other.colors[row, column] - colors[at]).mean(axis=1), UNLIKE)
+        worst = best[:, at].argmax(axis=0)
+        best[worst, at] = np.minimum(best[worst, at], np.where(shows, unlike, UNLIKE))
+        on = np.abs(z / np.maximum(mapped, 1e-9) - 1) < AGREE
+        near[at] += on
+        flat[at] += np.where(on, unlike, 0)
+        angle = np.arccos(np.clip((rays[at] * _unit(points[at] - other.centre)).sum(axis=1), -1, 1))
+        apart[at] = np.maximum(apart[at], np.where(shows, np.degrees(angle), 0))
+    seen = np.maximum(support + against, 1)
+    good = (support >= LEAST_SUPPORT) & (apart > LEAST_ANGLE) & (against <= AGAINST * seen)
+    difference = best.mean(axis=0)
+    cost = difference + PER_AGAINST * against / seen - PER_SUPPORT * np.minimum(support, MANY)
+    return np.where(good, cost, np.inf), difference, np.where(near > 0, flat / np.maximum(near, 1), np.inf)
+
+
+def _unit(rays: np.ndarray) -> np.ndarray:
+    return np.asarray(rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12))
