@@ -128,6 +128,15 @@ class Board:
             raise InputError(f"--marker is {self.marker}; expected a length above 0, under the square's {self.square}")
         if self.kind == "charuco" and not hasattr(cv2.aruco, f"DICT_{self.dictionary}"):
             raise InputError(f"--dictionary '{self.dictionary}' is not known; expected OpenCV's, such as 5X5_100")
+        if self.kind == "charuco" and (needed := self.squares[0] * self.squares[1] // 2) > (held := self._markers()):
+            raise InputError(
+                f"--dictionary '{self.dictionary}' has {held} markers, a board of {self.squares[0]}x{self.squares[1]} "
+                f"squares needs {needed}; give the one that it was printed with"
+            )
+
+    def _markers(self) -> int:
+        """Of the dictionary."""
+        return len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}")).bytesList)
 
     @classmethod
     def from_text(cls, text: str) -> Board:
@@ -138,6 +147,8 @@ class Board:
             columns, rows = (int(side) for side in squares.lower().split("x"))
             side = float(square)
             return cls(kind, (columns, rows), side, float(marker or 0.75 * side), dictionary or "5X5_100")
+        except InputError:
+            raise
         except ValueError as error:
             raise InputError(f"board: found '{text}', {expected}") from error
 

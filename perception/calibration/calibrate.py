@@ -18,7 +18,8 @@ from perception.errors import InputError
 from perception.io.atomic import write_file
 from perception.map.outputs import check_side_file, refuse_inputs
 from perception.photos.camera_file import camera_data, write_camera
-from perception.photos.decode import SUFFIXES, read_grey
+from perception.photos.decode import read_grey
+from perception.photos.folder import list_photos
 from perception.photos.video import frames
 
 MAX_FRAMES = 240
@@ -44,7 +45,7 @@ def run_calibration(source: Path, output: Path, board: Board, model: str = "auto
     too similar.
     """
     report = output.with_suffix(".json") if output.suffix.lower() in (".yaml", ".yml") else Path(f"{output}.json")
-    refuse_inputs([output, report], _photos(source) if source.is_dir() else [source])
+    refuse_inputs([output, report], list_photos(source) if source.is_dir() else [source])
     check_side_file(report, output, "distortion_model")
     found, size, looked_at = _detect(source, board)
     views = distinct_views(found, size[0])
@@ -82,14 +83,10 @@ def best_model(views: list[Detection], size: tuple[int, int], model: str = "auto
     return solved[0] if len(solved) == 2 and solved[1].rms > 0.95 * solved[0].rms else solved[-1]
 
 
-def _photos(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
-
-
 def _pictures(source: Path) -> Iterator[tuple[str, np.ndarray]]:
     """(name, grey image [H, W] uint8) of a folder's photos in order of name, or of a video's frames."""
     if source.is_dir():
-        files = _photos(source)
+        files = list_photos(source)
         if not files:
             raise InputError(f"{source}: holds no photos; expected pictures of a calibration board")
         for file in files:

@@ -54,13 +54,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         args = build_parser().parse_args(argv)
         result, text = args.run(args)
-        if args.json:
-            print(json.dumps(result, allow_nan=False, default=str))
-        elif text:
-            print(text)
+        if args.json or text:
+            _answer(json.dumps(result, allow_nan=False, default=str) if args.json else text)
     except InputError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+        return _refused(error)
     except KeyboardInterrupt:
         message = f"interrupted; what was done is kept, go on with: {_resume(argv)}"
         print(getattr(args, "interrupted", message), file=sys.stderr)
@@ -70,7 +67,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:  # a path that the system refuses, wherever it is used first
         if error.filename is None or error.strerror is None:
             raise
-        line = InputError(f"{error.filename}: {error.strerror}; give another path, or allow access to this one")
-        print(f"error: {' '.join(str(line).split())}", file=sys.stderr)
-        return 2
+        advice = "give another path, or allow access to this one"
+        return _refused(InputError(f"{error.filename}: {error.strerror}; {advice}"))
     return 0
+
+
+def _answer(text: str) -> None:
+    """Prints the answer. InputError where it cannot be written."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else the same error at the end of Python
+        raise InputError(f"the answer cannot be written: {error.strerror}; make space for it") from error
+
+
+def _refused(error: InputError) -> int:
+    """Prints an error as one line; the exit code."""
+    print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+    return 2

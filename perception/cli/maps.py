@@ -206,7 +206,7 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     if args.splat is not None:
         from perception.export.splat import export_splat
 
-        splat, text = export_splat(args.map, args.splat, args.only, args.without, args.each)
+        splat, text = export_splat(args.map, args.splat, args.only, args.without, args.each, inputs)
         facts |= splat
         lines.append(text)
     if args.graph is not None:

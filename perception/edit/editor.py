@@ -29,7 +29,7 @@ from perception.map.files import map_signature, read_info
 from perception.map.history import is_removed, joined_record, past_of
 from perception.map.map import Map, language_in, prefixed
 from perception.map.replace import writing
-from perception.map.write import read_map, write_map
+from perception.map.write import read_map, tidy_label, write_map
 
 UNDO_DEPTH = 100
 
@@ -182,7 +182,7 @@ class Editor:
     @_step
     def rename(self, instance: int, label: str | None) -> None:
         """Sets the user's label of an instance; an empty label or None removes it."""
-        label = " ".join(label.split()) if label else None
+        label = tidy_label(label) if label and label.strip() else None
         self._change(f"named {instance} '{label}'" if label else f"took the name of {instance}", instance, label=label)
 
     @_step

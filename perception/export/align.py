@@ -33,6 +33,8 @@ SCALES = 2.0 ** np.arange(-2, 1.51, 1 / 9)
 """Scales to try around the ratio of the extents, 8 % apart."""
 GRID = 28
 """Voxels of the correlation along the map's diagonal, divided by √3 in a cube."""
+LARGEST_SCAN = 12
+"""Times the map's diagonal: the correlation of a larger scan takes gigabytes."""
 REFINED, JUDGED = 100, 16
 """Places that are refined with few points and views, and the best of them, refined with more."""
 FINALISTS = 3
@@ -114,6 +116,9 @@ class Registration:
         self.extent, scan_extent = _extent(self.points), _extent(raw)
         if not scan_extent > 0:
             raise InputError("scan: its points lie in one place; nothing can be aligned")
+        if not similar and scan_extent > LARGEST_SCAN * self.extent:
+            ratio = f"it is {scan_extent / self.extent:.0f} times as large as the map, whose unit is the metre"
+            raise InputError(f"scan: {ratio}; give it in metres, or cut it to what the map shows")
         unit = self.extent / scan_extent if similar else 1.0
         self.scales = unit * SCALES if similar else np.ones(1)
         self.tolerance = TOLERANCE * self.extent

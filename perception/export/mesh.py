@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from perception.geometry import camera_centres
 from perception.io.atomic import atomic_file
 from perception.io.cloud import write_cloud
 from perception.io.open3d import fuse_depth, write_glb
+from perception.machine import require_memory
 from perception.map.write import Map
 from perception.types import PointCloud
 
@@ -27,6 +29,8 @@ MESHES = (".ply", ".glb")
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 MOST_VOXELS = 200_000_000
 _SLAB = 1 << 19
+BODY_BYTES = 150
+"""Of each voxel while a closed mesh is made."""
 
 
 def check_outputs(mesh: Path | None, voxels: Path | None, voxel_size: float | None) -> None:
@@ -187,6 +191,7 @@ def closed_body(
     from skimage.measure import marching_cubes
 
     shape = grid_shape(low, high, voxel)
+    require_memory(BODY_BYTES * math.prod(shape), f"--voxel-size {voxel:g}", "choose larger voxels")
     voxels, reach = centres(low, shape, voxel), 3 * voxel
     on, free, gap = observe(voxels, views, reach)
     level = np.where((on > 0) & (2 * on >= free), gap / reach, np.where(free > 0, 1.0, -1.0))

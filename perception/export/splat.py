@@ -12,17 +12,23 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.ply import map_ply, write_ply
 from perception.map.map import Map
+from perception.map.outputs import refuse_inputs
 
 ID = "instance_id"
 
 
 def export_splat(
-    map_path: Path, output: Path, only: Sequence[int] = (), without: Sequence[int] = (), each: bool = False
+    map_path: Path,
+    output: Path,
+    only: Sequence[int] = (),
+    without: Sequence[int] = (),
+    each: bool = False,
+    inputs: Sequence[Path | None] = (),
 ) -> tuple[dict[str, Any], str]:
     """Writes the rows of a map's Gaussians in their order, their properties byte for byte, and instance_id int32,
     −1 = none. only, without: ids of the instances that are written, or left out. each: a file for every instance
     (of `only`), OUT-ID.ply. A map of a splat gives back the properties of its file that no map holds, if the file lies
-    where it lay. Returns (facts, text). InputError for an unknown id."""
+    where it lay. inputs: files that this must not write. Returns (facts, text). InputError for an unknown id."""
     if output.suffix.lower() != ".ply":
         raise InputError(f"{output}: expected a file OUT.ply for --splat; -o OUT.spz writes compressed Gaussians")
     gmap = Map.open(map_path)
@@ -32,11 +38,11 @@ def export_splat(
         if number not in known:
             raise InputError(f"{map_path}: has no instance {number}; `perception query` and `info` list those it has")
     rows = _rows(gmap, map_path)
-    chosen = np.isin(ids, only) if only else ~np.isin(ids, without)
-    files = {output: chosen}
+    wanted = [number for number in only or known if number not in without]
+    files = {output: np.isin(ids, wanted) if only else ~np.isin(ids, without)}
     if each:
-        wanted = [number for number in only or known if number not in without]
         files = {output.with_name(f"{output.stem}-{number}.ply"): ids == number for number in wanted}
+    refuse_inputs(files, [map_path, *inputs])
     written = {}
     for file, mask in files.items():
         columns = {name: np.ascontiguousarray(rows[name][mask]) for name in rows.dtype.names or () if name != ID}

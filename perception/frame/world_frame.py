@@ -13,7 +13,7 @@ from perception.errors import InputError
 from perception.frame.gravity import Gravity, floor_height, gravity_of_scene
 from perception.frame.known_size import scale_of_board, scale_of_pixels, scale_of_tags
 from perception.frame.recentre import moved_scene
-from perception.frame.scale import Measurement, combined, known_length, scale_of_depth, scale_of_gps
+from perception.frame.scale import KnownLength, Measurement, combined, known_length, scale_of_depth, scale_of_gps
 from perception.geometry import camera_centres, transform
 from perception.photos.depth import load_depth
 from perception.types import Scene, View
@@ -67,18 +67,25 @@ def measured_scale(
     """Metres per unit from all sources that posed views offer, and notes. InputError as `in_world_frame`."""
     gps, notes = scale_of_gps(views, seed)
     found = [scale_of_depth(views, points, seed), gps]
-    if options.known_length is not None:
-        length = known_length(options.known_length)
-        if length.pixels is None:
-            what = "before the map exists it is given by pixels of photos, 'METRES: PHOTO X,Y X,Y; PHOTO X,Y X,Y'"
-            raise InputError(f"known length: {what}; by instances or points of a finished map with `perception scale`")
+    length, board = references(options)
+    if length is not None:
         found.append(scale_of_pixels(views, length))
     if options.tag_size is not None:
         found.append(scale_of_tags(views, options.tag_size))
-    if options.board is not None:
-        found.append(scale_of_board(views, Board.from_text(options.board)))
+    if board is not None:
+        found.append(scale_of_board(views, board))
     scale, warnings = combined([each for each in found if each is not None])
     return scale, [*notes, *warnings]
+
+
+def references(options: FrameConfig) -> tuple[KnownLength | None, Board | None]:
+    """The length in photos and the board that the settings name. InputError for what cannot be read, or is no length in
+    photos."""
+    length = None if options.known_length is None else known_length(options.known_length)
+    if length is not None and length.pixels is None:
+        what = "before the map exists it is given by pixels of photos, 'METRES: PHOTO X,Y X,Y; PHOTO X,Y X,Y'"
+        raise InputError(f"known length: {what}; by instances or points of a finished map with `perception scale`")
+    return length, None if options.board is None else Board.from_text(options.board)
 
 
 def _unit(scene: Scene, options: FrameConfig, posed: bool, seed: int) -> tuple[bool, Measurement | None, list[str]]:

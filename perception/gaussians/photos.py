@@ -33,7 +33,7 @@ def split_scene(scene: Scene, options: PhotoConfig) -> tuple[Scene, list[View], 
     """
     views, listed, every = scene.views, options.held_out, options.holdout
     if listed is not None:
-        names = _names(Path(listed))
+        names = held_out_names(Path(listed))
         held = [bool(names & {folded(view.name), folded(PurePosixPath(view.name).stem)}) for view in views]
         if all(held):
             raise InputError(f"{listed}: names all {len(views)} photos; some must be left to train on")
@@ -46,7 +46,8 @@ def split_scene(scene: Scene, options: PhotoConfig) -> tuple[Scene, list[View], 
     return replace(scene, views=sorted([*training, *held_out], key=lambda view: view.name)), training, held_out
 
 
-def _names(listed: Path) -> set[str]:
+def held_out_names(listed: Path) -> set[str]:
+    """The names that a file lists, in small letters. InputError when it cannot be read."""
     try:
         return {folded(line.strip()) for line in text_of(listed.read_bytes()).splitlines() if line.strip()}
     except (OSError, UnicodeDecodeError) as error:

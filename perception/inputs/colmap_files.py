@@ -166,7 +166,11 @@ def _text_images(model: Model) -> Iterator[tuple[str, list[str], str]]:
         if len(fields) < 10:
             raise InputError(f"{start}: expected an image: id, quaternion, position, camera, name; found {brief(line)}")
         model.names[int(_numbers([fields[0], fields[8]], start)[0])] = fields[9]
-        yield start, fields, next(lines, ("", ""))[1]
+        points = next(lines, ("", ""))[1]
+        if len(points.split()) % 3:
+            what = f"the line after this image holds {brief(points)}; expected its points 'x y id …', or an empty line"
+            raise InputError(f"{start}: {what}")
+        yield start, fields, points
 
 
 def _lines(model: Model, kind: str) -> Iterator[tuple[str, str]]:

@@ -22,6 +22,7 @@ int32, until [M] int32 as in `past`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -84,9 +85,11 @@ def date_of(visits: Sequence[Visit], number: int) -> str:
 def visit_number(visits: Sequence[Visit], text: str | int) -> int:
     """The visit that `text` names: its number, or "last", the one before the newest; InputError when there is none."""
     newest = len(visits) - 1
-    number = max(newest - 1, 0) if text == "last" else int(text) if str(text).isdecimal() else -1
+    number = max(newest - 1, 0) if text == "last" else int(text) if re.fullmatch(r"\d{1,9}", str(text)) else -1
     if not 0 <= number <= newest:
-        raise InputError(f"visit {text}: the map has visits 0 to {newest}; give one of these numbers, or last")
+        raise InputError(
+            f"visit {str(text)[:20]}: the map has visits 0 to {newest}; give one of these numbers, or last"
+        )
     return number
 
 

@@ -57,7 +57,7 @@ FACTS = typed({
     "format_version": int, "num_gaussians": Count, "num_instances": Count, "sh_degree": Count,
     "frame?": Text, "metric?": bool, "source?": PathText, "seed?": Bytes,
     "config?": {
-        "language?": {"encoder?": Text, "zooms?": Count, "texts?": Text},
+        "language?": {"encoder?": PathText, "zooms?": Count, "texts?": Text},
         "photos?": {"max_side?": Annotated[int, Field(ge=16, le=65536)]},
     },
     "scene?": {

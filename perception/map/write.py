@@ -128,6 +128,8 @@ def tidy_label(label: str) -> str:
         raise InputError('label: it is empty; write a name such as "grandma\'s cup", or --clear to take it away')
     if len(tidy) > LONGEST_LABEL:
         raise InputError(f"label: {len(tidy)} characters, at most {LONGEST_LABEL} are kept; choose a shorter name")
+    if any("\ud800" <= letter <= "\udfff" for letter in tidy):
+        raise InputError("label: it holds bytes that are no UTF-8, or half of a surrogate pair; write it in UTF-8")
     return tidy
 
 

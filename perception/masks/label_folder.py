@@ -71,10 +71,10 @@ class LabelFolder(MaskSource):
 
 
 def _check_header(file: Path, width: int, height: int) -> None:
-    """InputError unless the PNG has one channel of 8 or 16 bit and that size."""
+    """InputError unless the PNG has one channel of 8 or 16 bit, or a palette, and that size."""
     *size, bits, colour_type = read_png_header(file)
     kind = _COLOUR_TYPES.get(colour_type, f"colour type {colour_type}")
-    if kind not in ("grey", "palette") or bits not in (8, 16):
+    if kind != "palette" and (kind != "grey" or bits not in (8, 16)):
         raise InputError(f"{file}: a {bits}-bit {kind} image; a label image has one channel of 8 or 16 bit")
     if size != [width, height]:
         both = f"{size[0]}×{size[1]} pixels, but its photo has {width}×{height}"

@@ -91,6 +91,7 @@ def why_left_out(path: Path, strict: bool = False) -> str | None:
         with open_photo(path) as image:
             image.draft("RGB", reduced_size(*image.size, 8))
             decode(image, path)
+            _refuse_kind(image, path)
     except InputError as error:
         if strict:
             raise
@@ -310,14 +311,19 @@ def _claims(data: bytes) -> tuple[tuple[int, int], str | None]:
         return (int(tags[0x0100]), int(tags[0x0101])), "TIFF"
 
 
+def _refuse_kind(image: Image.Image, path: Path) -> None:
+    if image.mode in ("F", "LAB"):
+        kind = "floating-point images are not photos" if image.mode == "F" else "its colours are CIE L*a*b*"
+        raise InputError(f"{path}: {kind}; convert it to RGB of 8 or 16 bit")
+
+
 def to_rgb(image: Image.Image, path: Path) -> np.ndarray:
     """A decoded photo as uint8 [h, w, 3]; see read_photo."""
+    _refuse_kind(image, path)
     if image.mode.startswith("I"):  # 16-bit grey, as "I;16" or as 32-bit "I"
         grey = np.clip(np.asarray(image).astype(np.float64), 0, 65535)
         eight = (grey / 257 + 0.5).astype(np.uint8)
         return np.ascontiguousarray(np.repeat(eight[..., None], 3, axis=2))
-    if image.mode == "F":
-        raise InputError(f"{path}: floating-point images are not photos; convert it to 8 or 16 bit")
     if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
         rgba = image.convert("RGBA")
         black = Image.new("RGBA", rgba.size, (0, 0, 0, 255))

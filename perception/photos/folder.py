@@ -13,7 +13,7 @@ from PIL import Image
 
 from perception.errors import InputError
 from perception.machine import cores
-from perception.photos.decode import SUFFIXES, decode, open_photo, photo_size, upright
+from perception.photos.decode import SUFFIXES, decode, open_photo, photo_size, to_rgb, upright
 from perception.photos.lens import resized
 from perception.photos.video import FRAMES_RECORD, THUMBNAIL, motion_between
 from perception.progress import Progress
@@ -145,7 +145,7 @@ def _look(path: Path, folder: Path, strict: bool) -> _Look:
             decode(image, path)
             scale = max(1, max(image.size) // THUMBNAIL)
             small = image.reduce(scale) if scale > 1 and image.mode in ("L", "RGB") else image
-            grey = upright(small, path).convert("L")
+            grey = Image.fromarray(to_rgb(upright(small, path), path)).convert("L")
             look.grey = np.array(grey.resize(_thumbnail_size(look.size), Image.Resampling.BOX))
     except InputError as error:
         if strict:

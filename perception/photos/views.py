@@ -62,6 +62,8 @@ def fit_lens(lens: Lens, photo: Path, as_stored: bool) -> Lens | None:
     size, full = photo_size(photo, as_stored), (lens.width, lens.height)
     if size == full:
         return lens
+    if min(full) < 1:
+        return None
     other = abs(size[0] * size[1] / (full[0] * full[1]) - 1) > _RESIZED
     fits = size[0] * full[1] == size[1] * full[0] or (other and resized(size, full))
     return rescale_lens(lens, *size) if fits else None

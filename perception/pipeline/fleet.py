@@ -17,6 +17,9 @@ from perception.progress import QUIET, Progress
 from perception.report.page import write_own_report
 from perception.tasks.engine import Engine
 
+_WORDS = {"None": "none", "True": "on", "False": "off"}
+"""Values of YAML in the words of settings."""
+
 
 class Job(Settings):
     """One map: its input and output, paths relative to the list; its settings as `perception map` has them."""
@@ -48,7 +51,7 @@ def read_jobs(file: Path) -> list[dict[str, Any]]:
             raise InputError(
                 f"{where}: expected 'input: PHOTOS' and 'output: MAP.gsmap', and maybe 'set: {{KEY: VALUE}}'"
             )
-        pairs = [f"{key}={value}" for key, value in entry.get("set", {}).items()]
+        pairs = [f"{key}={_WORDS.get(str(value), value)}" for key, value in entry.get("set", {}).items()]
         given = {str(key): (value, where) for key, value in entry.items() if key != "set"}
         for key in ("input", "output"):
             if key not in given:
@@ -69,7 +72,10 @@ def read_jobs(file: Path) -> list[dict[str, Any]]:
         if other := known.get(name) or next((known[one] for one in known if _ignores_case(above)), None):
             raise InputError(f"{where}: has the output of job {other}, {output}")
         known[name] = number
-        config = load_config(settings, pairs, job.preset)
+        try:
+            config = load_config(settings, pairs, job.preset)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from error
         jobs.append({"input": str(source), "output": str(output), "settings": config.to_json()})
     return jobs
 

@@ -12,9 +12,9 @@ from typing import Any
 from perception.config import MapConfig
 from perception.errors import InputError
 from perception.frame.recentre import recentred
-from perception.frame.world_frame import in_world_frame
+from perception.frame.world_frame import in_world_frame, references
 from perception.gaussians.device import choose_device
-from perception.gaussians.photos import split_scene
+from perception.gaussians.photos import held_out_names, split_scene
 from perception.inputs.load import load_scene
 from perception.language.base import Encoder
 from perception.language.ocr import TextReader, make_reader
@@ -69,6 +69,9 @@ def build_map(
         run = _open_run(source, config, work, progress, engine)
         masks, encoder, reader = _open_models(run)
         splat = open_splat(source, config)
+        references(config.frame)
+        if config.photos.held_out is not None:
+            held_out_names(Path(config.photos.held_out))
 
         # Posed images I_v (§3.2) and a sparse cloud.
         scene = _posed_scene(output, run, splat)

@@ -18,7 +18,7 @@ import numpy as np
 
 from perception.colors import sh_from_rgb
 from perception.errors import InputError
-from perception.io.documents import brief
+from perception.io.documents import brief, refusing
 from perception.io.ply import Element, map_ply, ply_tables, read_ply
 from perception.splats.spz import read_spz
 
@@ -76,7 +76,8 @@ def read_splat(path: Path, check: Callable[[int], None] = lambda count: None) ->
         count = len(next(iter(rows.values())))
         _check_count(path, count)
         check(count)
-        splat = _compressed(rows) if "packed_position" in rows else _plain(path, rows)
+        with refusing(f"{path}: its elements do not fit each other ({{why}}); export it anew"):
+            splat = _compressed(rows) if "packed_position" in rows else _plain(path, rows)
     _check_count(path, len(splat))
     return _parked(path, splat)
 
@@ -128,7 +129,9 @@ def _plain(path: Path, rows: Mapping[str, np.ndarray]) -> Splat:
     if all(f"f_dc_{i}" in rows for i in range(3)):
         constant = table([f"f_dc_{i}" for i in range(3)])
     elif all(name in rows for name in ("red", "green", "blue")):
-        constant = np.asarray(sh_from_rgb(table(["red", "green", "blue"]) / 255), np.float32)
+        stored = table(["red", "green", "blue"])
+        shares = rows["red"].dtype.kind == "f" and stored.max(initial=0) <= 1
+        constant = np.asarray(sh_from_rgb(stored if shares else stored / 255), np.float32)
         notes.append("colours are those of red, green and blue: there is no f_dc_0")
     else:
         raise InputError(f"{path}: has no colours; expected f_dc_0 to f_dc_2, or red, green and blue")

@@ -58,6 +58,14 @@ def with_geometry(entry: dict[str, Any], gaussians: Gaussians, rows: np.ndarray)
     return {**entry, **{key: made[key] for key in _GEOMETRY}}
 
 
+def with_parts(entry: dict[str, Any], gaussians: Gaussians, part_ids: np.ndarray) -> dict[str, Any]:
+    """The entry whose parts have the boxes of their Gaussians, too; without those that have none. part_ids [N]."""
+    if "parts" not in entry:
+        return entry
+    owned = [(part, np.flatnonzero(part_ids == part["id"])) for part in entry["parts"]]
+    return {**entry, "parts": [with_geometry(part, gaussians, rows) for part, rows in owned if len(rows)]}
+
+
 def recorded(entry: dict[str, Any], visit: int, signs: Signs, motion: Motion | None, gone: bool) -> dict[str, Any]:
     """The entry of an old instance after a visit, still with its old geometry. gone: it does not stand there."""
     known = {"first_seen": 0, "last_seen": visit - 1, "last_looked_for": visit - 1}

@@ -37,7 +37,15 @@ from perception.pipeline.instances import DescribedInstances, describe
 from perception.pipeline.optimise import Optimised, Run
 from perception.pipeline.record import finite, score_views
 from perception.progress import QUIET, Progress
-from perception.visits.record import joined_language, kept_parts, past_with, recorded, visits_with, with_geometry
+from perception.visits.record import (
+    joined_language,
+    kept_parts,
+    past_with,
+    recorded,
+    visits_with,
+    with_geometry,
+    with_parts,
+)
 from perception.visits.today import Today, seen_today
 from perception.visits.visit import TENSORS, Visit, open_visit
 
@@ -137,10 +145,7 @@ def assembled(visit: Visit, today: Today, described: DescribedInstances, output:
         motion, rows = today.motions.get(entry["id"]), np.flatnonzero(today.ids == entry["id"])
         entry = recorded(entry, number, signs, motion, entry["id"] in today.gone)
         if not is_removed(entry) and (motion is not None or len(rows) != entry["num_gaussians"]):
-            entry = with_geometry(entry, gaussians, rows)
-            owned = [(part, np.flatnonzero(today.part_ids == part["id"])) for part in entry.get("parts", ())]
-            if owned:
-                entry = {**entry, "parts": [with_geometry(part, gaussians, own) for part, own in owned if len(own)]}
+            entry = with_parts(with_geometry(entry, gaussians, rows), gaussians, today.part_ids)
         instances.append(entry)
     for i, entry in zip(today.added, described.instances, strict=True):
         known = today.added[i][1]

@@ -9,11 +9,13 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from PIL import Image
 
 from perception.calibration.board import Board, Detection
 from perception.calibration.calibrate import best_model, distinct_views, run_calibration
 from perception.calibration.solve import NAMES, project, solve
 from perception.cli import main
+from perception.errors import InputError
 from perception.photos.camera_file import read_camera
 from perception.photos.lens import camera_from_lens
 from support.board_pictures import KnownCamera, board_views, render_board
@@ -217,3 +219,17 @@ def test_distinct_views_are_those_that_moved() -> None:
     views = perfect_views(camera, 3)
     shaken = [Detection("s", v.board_points, v.pixels + 2.0) for v in views]
     assert distinct_views([*views, *shaken], 640) == views
+
+
+def test_a_board_of_more_markers_than_its_dictionary_has() -> None:
+    assert Board.from_text("charuco:10x10:0.03:0.022:4X4_50").squares == (10, 10)
+    with pytest.raises(InputError, match="has 50 markers, a board of 12x9 squares needs 54"):
+        Board.from_text("charuco:12x9:0.03:0.022:4X4_50")
+
+
+def test_what_macs_leave_beside_photos_is_no_photo(tmp_path) -> None:
+    Image.fromarray(np.zeros((40, 60), np.uint8)).save(tmp_path / "a.png")
+    (tmp_path / "._a.png").write_bytes(b"no photo")
+    (tmp_path / "b.jpg").mkdir()
+    with pytest.raises(InputError, match="found in 1 pictures"):
+        run_calibration(tmp_path, tmp_path / "camera.yaml", Board("checkerboard", (7, 5), 0.03))

@@ -190,3 +190,10 @@ def test_the_place_is_the_same_to_the_bit_on_any_number_of_threads() -> None:
             ).stdout
         )
     assert len(told) == 1
+
+
+def test_a_scan_in_millimetres_is_told(furnished: list[module.DepthView]) -> None:
+    """The grid of the correlation took terabytes."""
+    scan = 1000 * scan_of(FURNISHED, np.eye(4))
+    with pytest.raises(InputError, match=r"scan: it is \d+ times as large as the map"):
+        align(furnished, PointCloud(scan), similar=False)

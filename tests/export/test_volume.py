@@ -139,3 +139,9 @@ def test_glb_holds_the_mesh(tmp_path: Path) -> None:
     linear = mesh.visual.vertex_colors[:, 0].astype(int)  # 255 (128 / 255)^2.2 = 56
     np.testing.assert_allclose(linear, [0, 255, 0, 56], atol=1)
     assert [file.name for file in tmp_path.iterdir()] == ["m.glb"]
+
+
+def test_a_body_that_memory_does_not_hold_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("perception.machine.available_memory", lambda: 2.0**28)
+    with pytest.raises(InputError, match="choose larger voxels"):
+        closed_body(np.full(3, -0.6), np.full(3, 0.6), 0.008, ball_views(2), np.zeros((1, 3)), np.ones(1, bool))

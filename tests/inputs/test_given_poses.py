@@ -268,3 +268,12 @@ def test_poses_of_other_programs_are_named(tmp_path: Path) -> None:
     assert len(lines) == 1 and "not read: poses_bounds.npy" in lines[0]
     (line,) = other_inputs(tmp_path / "in" / "images", reader_of(tmp_path / "in" / "images"))
     assert f"{tmp_path / 'in' / 'sparse'} holds poses" in line
+
+
+def test_images_without_their_lines_of_points_are_refused(tmp_path: Path) -> None:
+    """Every second photo was taken for points, and not told."""
+    source = workspace(tmp_path)
+    file = source / "sparse/0/images.txt"
+    file.write_text("\n".join(line for line in file.read_text().splitlines() if line))
+    with pytest.raises(InputError, match="expected its points"):
+        loaded(source)

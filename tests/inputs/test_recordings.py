@@ -112,6 +112,7 @@ BAD = [
     ("tum", lambda s: (s / "groundtruth.txt").write_text("1 0 0 0 0 0 0 1"), "no photo lies between two poses"),
     ("tum", lambda s: (s / "groundtruth.txt").write_text("1 0 0 0 0 0 0 0"), "a quaternion is zero"),
     ("tum", lambda s: (s / "groundtruth.txt").write_text("1 0 x"), "expected lines of 8 numbers"),
+    ("tum", lambda s: (s / "groundtruth.txt").write_text("1 nan 0 0 0 0 0 1"), "holds no pose of finite numbers"),
     ("tum", lambda s: (s / "rgb.txt").write_text("abc"), "expected lines 'time file'"),
     ("tum", lambda s: _edit(s / "groundtruth.txt", ".", ","), "has a decimal comma"),
     ("scannet", lambda s: _edit(s / "intrinsic/intrinsic_color.txt", ".", ","), "has a decimal comma"),

@@ -19,11 +19,15 @@ from perception.config import load_config
 from perception.edit.editor import Editor
 from perception.errors import InputError
 from perception.gaussians.train import Trainer
+from perception.io.cloud import write_cloud
+from perception.io.ply import map_ply
+from perception.map.map import Map
 from perception.map.replace import lock_file, writing
 from perception.map.write import read_map, set_labels, verify_map, write_map
 from perception.pipeline import mapping
 from perception.pipeline.checkpoint import CHECKPOINT, INPUTS, load_checkpoint, save_checkpoint, work_folder
 from perception.pipeline.mapping import build_map
+from perception.types import PointCloud
 from support.paths import SUPPORT
 from support.query_maps import write_map_of
 
@@ -272,3 +276,43 @@ def test_resuming_a_finished_run_tidies_up_and_changes_nothing(small_scene: Path
         with pytest.raises(InputError, match="exists already"):
             build_map(source, out, other, resume=True)
     assert main(["map", str(source), "-o", str(out)]) == 2
+
+
+def test_exported_splats_overwrite_no_input(gmap: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The file of an instance, OUT-ID.ply, was written over the scan to label, and then read as the scan."""
+    ids = Map.open(gmap).instance_ids
+    scan = tmp_path / "scan-0.ply"
+    write_cloud(scan, PointCloud(np.random.default_rng(0).normal(size=(50, 3))))
+    before = scan.read_bytes()
+    command = ["export", str(gmap), "--splat", str(tmp_path / "scan.ply"), "--each"]
+    assert main([*command, "--points", str(scan), "-o", str(tmp_path / "labelled.ply")]) == 2
+    assert "which this command reads" in capsys.readouterr().err and scan.read_bytes() == before
+    assert main([*command[:-1], "--only", "0", "1", "--without", "1"]) == 0
+    assert len(map_ply(tmp_path / "scan.ply", "vertex")) == np.sum(ids == 0)
+
+
+def test_an_answer_that_cannot_be_written_is_one_line(gmap: Path) -> None:
+    if not Path("/dev/full").exists():
+        pytest.skip("no /dev/full")
+    code = "import sys; from perception.cli import main; sys.exit(main(sys.argv[1:]))"
+    with open("/dev/full", "w") as full:  # noqa: PTH123 - a device
+        run = subprocess.run([sys.executable, "-c", code, "info", str(gmap)], stdout=full, stderr=subprocess.PIPE)
+    assert run.returncode == 2 and run.stderr.decode().startswith("error: the answer cannot be written: No space")
+    assert run.stderr.count(b"\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("setting", "why"),
+    [
+        ("frame.known_length=0.3: 0, 1", "before the map exists"),
+        ("frame.board=charuco", "expected KIND:COLSxROWS:SQUARE"),
+        ("photos.held_out=/nowhere/list.txt", "cannot be read"),
+    ],
+)
+def test_settings_that_cannot_be_used_are_told_before_any_work(
+    setting: str, why: str, small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They were told after structure from motion, whose results were then deleted."""
+    monkeypatch.setattr("perception.pipeline.mapping.load_scene", None)
+    with pytest.raises(InputError, match=why):
+        build_map(small_scene, tmp_path / "a.gsmap", config(small_scene, setting))

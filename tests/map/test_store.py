@@ -265,7 +265,7 @@ def test_labels_are_kept_with_right_checksums(copied: Path) -> None:
     assert [entry["label"] for entry in read_map(copied).instances[:3]] == [None, "fruit", None]
     assert set(verify_map(copied).values()) == {"ok"}
     assert perception.load_map(copied).map_id != before
-    for bad in ({99: "x"}, {1: " "}):
+    for bad in ({99: "x"}, {1: " "}, {1: "caf\udce9"}):
         with pytest.raises(InputError):
             set_labels(copied, bad)
     assert read_map(copied).instances[1]["label"] == "fruit"

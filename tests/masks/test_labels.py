@@ -53,12 +53,14 @@ def test_labels_of_8_and_16_bit_arrive_unchanged(folder):
         np.testing.assert_array_equal(labels, expected)
 
 
-def test_palette_indices_are_the_labels(tmp_path):
+@pytest.mark.parametrize("colors", [200, 12, 3, 2])
+def test_palette_indices_are_the_labels(tmp_path, colors):
+    """Of few colours Pillow writes 4, 2 and 1 bit."""
     from PIL import Image
 
-    indices = np.arange(HEIGHT * WIDTH, dtype=np.uint8).reshape(HEIGHT, WIDTH) % 200
+    indices = np.arange(HEIGHT * WIDTH, dtype=np.uint8).reshape(HEIGHT, WIDTH) % colors
     image = Image.fromarray(indices, "P")
-    image.putpalette(list(np.random.default_rng(1).integers(0, 256, 768)))
+    image.putpalette(list(np.random.default_rng(1).integers(0, 256, 3 * colors)))
     image.save(tmp_path / "a.png")
     source = make_source(f"labels:{tmp_path}")
     source.check([view("a.jpg")])

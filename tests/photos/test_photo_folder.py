@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, TiffImagePlugin
 
 from perception.errors import InputError
 from perception.inputs.load import load_scene
@@ -23,6 +23,7 @@ from perception.photos.folder import choose_photos, list_photos, view_name
 from perception.photos.lens import load_pycolmap
 from perception.photos.views import fit_lens
 from perception.sfm.database import build_features
+from perception.sfm.features import _camera_key
 from perception.sfm.options import ReadOptions
 from perception.types import Lens
 from support.aimed import look_at
@@ -360,3 +361,36 @@ def test_a_photo_that_hangs_holds_up_no_other(tmp_path: Path, monkeypatch: pytes
     assert not readers[1].is_alive()
     end.set()
     readers[0].join(60)
+
+
+def test_grey_photos_of_16_bit_are_told_apart(tmp_path: Path) -> None:
+    """All of their thumbnails were white, so that one of them was kept."""
+    for index in range(5):
+        deep = texture(index)[..., 0].astype(np.uint16) * 200 + 2000
+        Image.fromarray(deep).save(tmp_path / f"{index}.png")
+    assert len(choose_photos(tmp_path, True, Told()).names) == 5
+
+
+@pytest.mark.parametrize("mode", ["F", "LAB"])
+def test_pictures_that_are_no_photos_are_left_out(mode: str, tmp_path: Path) -> None:
+    for index in range(4):
+        save(tmp_path / f"{index}.jpg", index)
+    Image.new(mode, (160, 120)).save(tmp_path / "x.tif")
+    chosen = choose_photos(tmp_path, False, Told())
+    assert len(chosen.names) == 4 and [entry["name"] for entry in chosen.left_out] == ["x.tif"]
+    assert "convert it to RGB" in str(why_left_out(tmp_path / "x.tif"))
+    with pytest.raises(InputError, match="convert it to RGB"):
+        read_photo(tmp_path / "x.tif")
+
+
+def test_a_zoom_of_0_over_0_is_one_camera(tmp_path: Path) -> None:
+    """Pillow reads it as NaN, which equals nothing: each photo had a camera of its own."""
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA404] = TiffImagePlugin.IFDRational(0, 0)
+    for index in range(3):
+        save(tmp_path / f"{index}.jpg", index, exif=exif)
+    assert len({_camera_key(tmp_path / f"{index}.jpg") for index in range(3)}) == 1
+
+
+def test_a_camera_without_pixels_fits_no_photo(tmp_path: Path) -> None:
+    assert fit_lens(Lens("PINHOLE", (60.0, 60.0, 0.0, 0.0), 0, 0), save(tmp_path / "a.png", 0), False) is None

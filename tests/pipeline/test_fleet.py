@@ -162,3 +162,15 @@ def test_a_list_that_is_no_yaml(tmp_path: Path) -> None:
     (tmp_path / "jobs.yaml").write_text("a: [")
     with pytest.raises(InputError, match="not readable YAML"):
         read_jobs(tmp_path / "jobs.yaml")
+
+
+def test_values_of_yaml_are_words_of_settings(tmp_path: Path) -> None:
+    jobs = "- {input: ., output: a.gsmap, set: {language.texts: off, train.time_limit: null, photos.strict: yes}}\n"
+    (tmp_path / "jobs.yaml").write_text(jobs)
+    (job,) = read_jobs(tmp_path / "jobs.yaml")
+    settings = job["settings"]
+    assert settings["language"]["texts"] == "off" and settings["train"]["time_limit"] is None
+    assert settings["photos"]["strict"] is True
+    with pytest.raises(InputError, match=r"jobs\.yaml, job 2: --set train\.iterations"):
+        read_jobs(written(tmp_path, [{"input": ".", "output": f"{n}.gsmap", "set": {"train.iterations": x}} for n, x in
+                                     enumerate((3, "many"))]))  # fmt: skip

@@ -231,3 +231,19 @@ def test_spz_that_cannot_be_read_is_told(tmp_path: Path) -> None:
     ):
         file.write_bytes(data)
         assert words in refused(file)
+
+
+def test_colours_between_0_and_1(tmp_path: Path) -> None:
+    values = {name: array for name, array in columns(0).items() if not name.startswith("f_dc")}
+    shares = np.linspace(0, 1, COUNT, dtype=np.float32)
+    as_shares = read_splat(write(tmp_path / "a.ply", values | dict.fromkeys(("red", "green", "blue"), shares)))
+    bytes_ = np.rint(255 * shares).astype(np.uint8)
+    as_bytes = read_splat(write(tmp_path / "b.ply", values | dict.fromkeys(("red", "green", "blue"), bytes_)))
+    assert np.allclose(0.5 + 0.28209479177387814 * as_shares.sh[:, 0, 0], shares, atol=1e-6)
+    assert np.allclose(as_shares.sh, as_bytes.sh, atol=0.5 / 255 / 0.28)
+
+
+def test_a_compressed_file_without_its_colours_is_one_line(tmp_path: Path) -> None:
+    rows = dict.fromkeys(("packed_position", "packed_rotation", "packed_scale"), np.zeros(COUNT, np.uint32))
+    with pytest.raises(InputError, match="do not fit each other"):
+        read_splat(write(tmp_path / "a.ply", rows))

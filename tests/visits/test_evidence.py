@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from perception.gaussians.model import from_points
 from perception.gaussians.views import TrainingView
 from perception.visits.evidence import signs_of
 from perception.visits.look import Look, in_view
+from perception.visits.record import with_parts
 
 SHAPE = 40, 50
 BOX = np.s_[10:30, 10:40]
@@ -76,3 +78,18 @@ def test_a_spot_where_no_photo_looks_is_worse_than_one_that_photos_contradict() 
     (there,) = signs_of([shown(3.0, same=False)], [7], np.ones(1), np.array([0.1]))
     (hidden,) = signs_of([shown(2.0, cover=30)], [7], np.ones(1), np.array([0.1]))
     assert not hidden.photos and hidden.same < there.same < 0
+
+
+def test_parts_of_a_thing_that_moved_lie_where_it_stands() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.1, 0.1, (60, 3)) + np.array([2, -1, 0.5])
+    gaussians = from_points(points, np.zeros((60, 3), np.uint8), feature_dim=1, seed=0)
+    part_ids = np.repeat([-1, 7, 8], 20)
+    old = {"score": 0.5, "num_gaussians": 20, "centroid": [9, 9, 9], "views": 3, "label": "lid"}
+    entry = {"id": 4, "parts": [{"id": 7, **old}, {"id": 9, **old}, {"id": 8, **old}]}
+    lid, cup = with_parts(entry, gaussians, part_ids)["parts"]  # 9 has no Gaussians any more
+    assert (lid["id"], lid["label"], cup["id"]) == (7, "lid", 8)
+    for part, own in ((lid, points[20:40]), (cup, points[40:])):
+        assert np.allclose(part["centroid"], own.mean(axis=0), atol=1e-3) and part["num_gaussians"] == 20
+        assert np.allclose(part["aabb"]["min"], own.min(axis=0), atol=0.02)
+    assert with_parts({"id": 4}, gaussians, part_ids) == {"id": 4}
