@@ -9,15 +9,15 @@ from perception.language.conse import ConseEncoder
 
 
 def make_encoder(spec: str) -> Encoder | None:
-    """The encoder that `spec` names. Files and model signatures are checked here, before any work.
+    """The encoder that `spec` names. Files and signatures are checked here, before any work.
 
-    "conse": the offline default. "clip:IMAGE.onnx,TEXT.onnx" or "clip:DIR": a CLIP-family pair. "none": None.
+    "conse", "auto": the offline default. "clip:IMAGE.onnx,TEXT.onnx", "clip:DIR": a CLIP-family pair. "none": None.
     Raises InputError for an unknown name, a missing package or file, and towers that do not match.
     """
     kind, _, argument = spec.partition(":")
     if kind == "none" and not argument:
         return None
-    if kind == "conse" and not argument:
+    if kind in ("conse", "auto") and not argument:
         return ConseEncoder()
     if kind == "clip" and argument:
         return ClipEncoder.from_spec(argument)

@@ -18,6 +18,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from perception.errors import InputError
+from perception.geometry import transform
 from perception.localise.evidence import doubt
 from perception.localise.joint import Adjustment, adjusted, contradicted
 from perception.localise.keypoints import described, tolerance
@@ -251,9 +252,8 @@ class _Search:
             if found.inliers.get(number, 0) < MIN_INLIERS:
                 self._drop(number, f"{found.inliers.get(number, 0)} features agree with its refined pose")
                 continue
-            self.placed[number] = np.eye(4)
-            self.placed[number][:3, :3] = found.poses.rotation[count + number]
-            self.placed[number][:3, 3] = -found.poses.rotation[count + number] @ found.poses.center[count + number]
+            rotation, centre = found.poses.rotation[count + number], found.poses.center[count + number]
+            self.placed[number] = transform(rotation, -rotation @ centre)
 
     def _drop(self, number: int, why: str) -> None:
         del self.placed[number], self.links[number]

@@ -16,6 +16,7 @@ import torch
 
 from perception.gaussians.model import Gaussians
 from perception.gaussians.views import TrainingView, expected_depth, render
+from perception.geometry import transform
 from perception.rasterizer.rasterize import rasterizer_for
 from perception.rasterizer.types import Settings
 from perception.visits.evidence import WEIGHTS, Signs, signs_from, sums_in
@@ -259,9 +260,7 @@ def _upright_starts(a: Points, b: Points, up: np.ndarray) -> list[np.ndarray]:
         step = (low_b + high_b - low_a - high_a) / 2
         rises = [(low_b - low_a - step) @ up, (high_b - high_a - step) @ up]
         for rise in rises if rises[1] - rises[0] < -HALF_HIDDEN * a.radius else rises[:1]:
-            pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = rotation, step + up * rise
-            poses.append(pose)
+            poses.append(transform(rotation, step + up * rise))
     return poses
 
 
@@ -328,9 +327,7 @@ def other_sides(
 
 def _about(rotation: np.ndarray, middle: np.ndarray) -> np.ndarray:
     """[4, 4] of a rotation [3, 3] about a point [3]."""
-    motion = np.eye(4)
-    motion[:3, :3], motion[:3, 3] = rotation, middle - rotation @ middle
-    return motion
+    return transform(rotation, middle - rotation @ middle)
 
 
 def judged(old: Gaussians, motions: Sequence[np.ndarray], cuts: Sequence[Cut], depth: float) -> list[Found]:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from perception.gaussians.model import Gaussians
-from perception.geometry import nearest_rotation, rotations
+from perception.geometry import nearest_rotation, rotations, transform
 
 YAWS = 12
 """Starting rotations about the vertical; the 24 that map a cube's axes to each other are tried as well."""
@@ -97,8 +97,7 @@ def register(old: Points, new: Points, up: np.ndarray) -> list[tuple[float, np.n
     middle_old, middle_new = (np.median(each.points, axis=0) for each in (old, new))
     starts = []
     for rotation in _starts(up):
-        start = np.eye(4)
-        start[:3, :3], start[:3, 3] = rotation, middle_new - rotation @ middle_old
+        start = transform(rotation, middle_new - rotation @ middle_old)
         starts.append(_icp(tree, old, new.some(ROUGH), start, radius, ROUNDS[0]))
     likely = sorted(starts, key=lambda found: found[0])[: 2 * BEST]
     fine = [_icp(tree, old, new.some(FINE), start, radius, ROUNDS[1]) for _, start in likely]
@@ -133,8 +132,7 @@ def _icp(
         residual = float(distance[kept].mean())
         a, b = old.points[nearest[kept]], new.points[kept]
         rotation = nearest_rotation((b - b.mean(axis=0)).T @ (a - a.mean(axis=0)))
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation, b.mean(axis=0) - rotation @ a.mean(axis=0)
+        pose = transform(rotation, b.mean(axis=0) - rotation @ a.mean(axis=0))
     return residual, pose
 
 

@@ -107,8 +107,7 @@ def _encoder_of(gmap: Map) -> Encoder | None:
     from perception.language.description import check_encoder
     from perception.language.encoders import make_encoder
 
-    spec = gmap.setting("language", "encoder", "auto")
-    encoder = make_encoder("conse" if spec == "auto" else spec)
+    encoder = make_encoder(str(gmap.setting("language", "encoder", "auto")))
     assert encoder is not None
     check_encoder(str(gmap.language["encoder"]), encoder.identity)
     return encoder
