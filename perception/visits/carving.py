@@ -17,6 +17,7 @@ import numpy as np
 from perception.gaussians.depth_start import DepthCloud
 from perception.gaussians.views import unprojected
 from perception.geometry import sums_by
+from perception.machine import in_threads
 from perception.masks.surface import voxel_keys
 from perception.visits.evidence import AGREE, LEAST_PIXELS, mask_odds
 from perception.visits.look import Look, projected
@@ -44,9 +45,11 @@ FOOTPRINT = 2.0
 
 @dataclass(frozen=True)
 class _Photo:
-    """A look with the pixels that changed [h, w] bool, its smoothed colours [h, w, 3] in [0, 1] and its centre [3]."""
+    """A look with its pixels that count and that changed [h, w] bool, its smoothed colours [h, w, 3] in [0, 1] and its
+    centre [3]."""
 
     look: Look
+    counts: np.ndarray
     changed: np.ndarray
     colors: np.ndarray
     centre: np.ndarray
@@ -55,8 +58,11 @@ class _Photo:
 def carved_surface(looks: Sequence[Look], changed: Sequence[np.ndarray]) -> DepthCloud:
     """Points on new things. changed: pixels [h, w] bool of each look whose surface the map lacks."""
     photos = [_photo(*pair) for pair in zip(looks, changed, strict=True)]
-    parts = [_on_rays(photo, label, photos) for photo in photos for label in _unmeasured_masks(photo)]
-    parts = [part for part in parts if len(part)]
+
+    def found_in(photo: _Photo) -> list[np.ndarray]:
+        return [_on_rays(photo, label, photos) for label in _unmeasured_masks(photo)]
+
+    parts = [part for each in in_threads(found_in, photos) for part in each if len(part)]
     if not parts:
         return DepthCloud(0.0, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     rows = np.concatenate(parts)
@@ -69,7 +75,10 @@ def carved_surface(looks: Sequence[Look], changed: Sequence[np.ndarray]) -> Dept
 def _photo(look: Look, changed: np.ndarray) -> _Photo:
     pose = look.view.camera_from_world.double().numpy()
     colors = cv2.GaussianBlur(look.view.photo.numpy().astype(np.float32) / 255, (0, 0), BLUR)
-    return _Photo(look, changed & (look.mapped > 0), np.asarray(colors), -pose[:3, :3].T @ pose[:3, 3])
+    counts = look.mapped > 0
+    if look.view.weight is not None:
+        counts &= look.view.weight.numpy() > 0
+    return _Photo(look, counts, changed & counts, np.asarray(colors), -pose[:3, :3].T @ pose[:3, 3])
 
 
 def _unmeasured_masks(photo: _Photo) -> list[int]:
@@ -137,7 +146,8 @@ def _judged(
         at = np.flatnonzero((z > 1e-3) & (column >= 0) & (row >= 0) & (column < width) & (row < height))
         row, column, z = row[at], column[at], z[at]
         mapped, measured = look.mapped[row, column], look.measured[row, column]
-        reached = (mapped > 0) & (z < mapped * (1 - AGREE / 2)) & ~((measured > 0) & (measured < z * (1 - AGREE)))
+        reached = (z < mapped * (1 - AGREE / 2)) & ~((measured > 0) & (measured < z * (1 - AGREE)))
+        reached &= other.counts[row, column]
         shows = reached & other.changed[row, column] & ~(measured > z * (1 + AGREE))
         support[at] += shows
         against[at] += reached & ~shows
