@@ -25,9 +25,9 @@ from perception.visits.look import Look, projected
 RAYS, STEPS, FINER, NEAREST = 300, 64, 9, 0.3
 """Rays of a mask; points on each, evenly in inverse depth, from the map's surface to NEAREST of its depth; points
 around the best one of them."""
-UNMEASURED, CHANGED = 0.5, 0.5
+UNMEASURED, CHANGED, COVERED = 0.5, 0.5, 0.3
 """Share of the changed pixels of a mask that stereo did not measure, and of its pixels that changed, from which its
-rays are searched."""
+rays are searched; share of them that what other photos measured covers, from which they are not."""
 OTHERS = 16
 """Most other photos by which the rays of a mask are judged."""
 LEAST_SUPPORT, LEAST_ANGLE, AGAINST = 2, 10.0, 0.2
@@ -55,12 +55,16 @@ class _Photo:
     centre: np.ndarray
 
 
-def carved_surface(looks: Sequence[Look], changed: Sequence[np.ndarray]) -> DepthCloud:
-    """Points on new things. changed: pixels [h, w] bool of each look whose surface the map lacks."""
+def carved_surface(looks: Sequence[Look], changed: Sequence[np.ndarray], known: np.ndarray) -> DepthCloud:
+    """Points on new things of which stereo measured little. changed: pixels [h, w] bool of each look whose surface the
+    map lacks. known [M, 3]: what was measured of it, evenly spread."""
+    from scipy.spatial import cKDTree
+
     photos = [_photo(*pair) for pair in zip(looks, changed, strict=True)]
+    spacing = float(np.median(cKDTree(known).query(known, k=2)[0][:, 1])) if len(known) > 1 else 0.0
 
     def found_in(photo: _Photo) -> list[np.ndarray]:
-        return [_on_rays(photo, label, photos) for label in _unmeasured_masks(photo)]
+        return [_on_rays(photo, label, photos) for label in _unmeasured_masks(photo, known, spacing)]
 
     parts = [part for each in in_threads(found_in, photos) for part in each if len(part)]
     if not parts:
@@ -81,14 +85,22 @@ def _photo(look: Look, changed: np.ndarray) -> _Photo:
     return _Photo(look, counts, changed & counts, np.asarray(colors), -pose[:3, :3].T @ pose[:3, 3])
 
 
-def _unmeasured_masks(photo: _Photo) -> list[int]:
-    """The masks that are mostly new, also where the map is too blurred to tell, and mostly not measured."""
+def _unmeasured_masks(photo: _Photo, known: np.ndarray, spacing: float) -> list[int]:
+    """The masks that are mostly new, also where the map is too blurred to tell, and mostly measured in no photo.
+    known [M, 3], spacing: see `carved_surface`."""
     labels = photo.look.labels
     areas = np.bincount(labels.ravel())
     new = np.bincount(labels[photo.changed], minlength=len(areas))
     bare = np.bincount(labels[photo.changed & (photo.look.measured == 0)], minlength=len(areas))
     chosen = (new >= LEAST_PIXELS) & (bare > UNMEASURED * new) & (new > CHANGED * areas)
-    return np.flatnonzero(chosen & (mask_odds(photo.look)[1] < 0)).tolist()
+    chosen &= mask_odds(photo.look)[1] < 0
+    pixel, z = projected(photo.look.view, known)
+    column, row = np.floor(pixel).astype(np.int64).T
+    height, width = labels.shape
+    at = np.flatnonzero((z > 1e-3) & (column >= 0) & (row >= 0) & (column < width) & (row < height))
+    square = (spacing * float(photo.look.view.K[0, 0]) / z[at]) ** 2  # pixels of the surface that a point stands for
+    covered = np.bincount(labels[row[at], column[at]], square, minlength=len(areas))
+    return np.flatnonzero(chosen & (covered < COVERED * areas)).tolist()
 
 
 def _on_rays(photo: _Photo, label: int, photos: Sequence[_Photo]) -> np.ndarray:

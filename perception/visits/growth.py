@@ -58,10 +58,9 @@ def new_surface(looks: Sequence[Look], like: Gaussians, budget: int, seed: int) 
     none, size = np.zeros((0, 3)), like.features.shape[1]
     measured = start_on_surface(views, none, none.astype(np.uint8), budget, size, seed)
     parts = [] if measured is None else [measured]
-    carved = carved_surface(looks, changed)
-    away = np.ones(len(carved.points), bool)
-    if measured is not None:
-        away = cKDTree(measured.means.numpy()).query(carved.points)[0] > APART * carved.side
+    known = none if measured is None else measured.means.double().numpy()
+    carved = carved_surface(looks, changed, known)
+    away = cKDTree(known).query(carved.points)[0] > APART * carved.side
     if away.any():
         parts.append(from_points(carved.points[away], carved.colors[away], feature_dim=size, seed=seed, opacity=UNSURE))
     if not parts:

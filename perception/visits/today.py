@@ -48,6 +48,8 @@ FRAGMENT = 0.3, 3
 """A new group of a score below, and of less than this many times the least Gaussians of a group, is a piece of what
 stands beside it, no thing; most things score .8 and more."""
 
+ALONG = 0.75, 0.25
+"""Share of the Gaussians of a piece that lie within this many radii of the thing that it is of."""
 OUTLINED = 0.5
 """Least IoU of a new thing with masks of the photos, relative to the median of those that stand where they stood."""
 
@@ -112,7 +114,9 @@ def seen_today(visit: Visit) -> Today:
         pairs = _moved(visit, grown, things, gone)
     whole = {j: carried(visit.thing(i), motion.new_from_old) for i, (j, motion) in pairs.items()}
     things = _apart(things, grown.means.double().numpy(), whole, run.config.instances.min_cluster_size)
-    return _settled(visit, grown, kept, ids, made, free, signs, gone, things, old, pairs, record)
+    with run.stage("motion"):
+        pieces = _pieces(visit, grown, things, whole)
+    return _settled(visit, grown, kept, ids, made, free, signs, gone, things, old, pairs, pieces, record)
 
 
 def _rows(things: list[tuple[np.ndarray, float]], numbers: set[int]) -> np.ndarray:
@@ -213,6 +217,31 @@ def _apart(
     return result
 
 
+def _pieces(
+    visit: Visit, grown: Gaussians, things: list[tuple[np.ndarray, float]], whole: dict[int, Gaussians]
+) -> set[int]:
+    """Numbers of the things that are pieces of a moved one, as masks may cut the legs off a chair: they lie along it as
+    it stands now (`whole`, by number), and the photos show as well without them what they show."""
+    from scipy.spatial import cKDTree
+
+    means, stays = grown.means.double().numpy(), np.setdiff1d(np.arange(len(grown)), _rows(things, set(whole)))
+    found = set[int]()
+    for j, (rows, _) in enumerate(things):
+        reach = [(cKDTree(p.points).query(means[rows])[0], p.radius) for p in map(Points.of, whole.values())]
+        if j in whole or all(np.quantile(away, ALONG[0]) > ALONG[1] * radius for away, radius in reach):
+            continue
+        ids = np.full(len(grown), -1, np.int32)
+        ids[rows] = j
+        shown = visit.looks(grown, ids)
+        without = Gaussians.concatenate([grown.rows(torch.from_numpy(np.setdiff1d(stays, rows))), *whole.values()])
+        looks = visit.looks(without, np.full(len(without), -1, np.int32))
+        looks = [replace(look, ids=with_it.ids) for look, with_it in zip(looks, shown, strict=True)]
+        (signs,) = signs_of(looks, [j], np.ones(1), np.full(1, np.inf))
+        if signs.photos and signs.alike > 0:
+            found.add(j)
+    return found
+
+
 def _settled(
     visit: Visit,
     grown: Gaussians,
@@ -225,15 +254,17 @@ def _settled(
     things: list[tuple[np.ndarray, float]],
     old: set[int],
     pairs: dict[int, tuple[int, Motion]],
+    pieces: set[int],
     record: TrainRecord,
 ) -> Today:
-    """Puts the Gaussians of moved things where the new ones grew, and trains the colours of all that was looked at."""
+    """Puts the Gaussians of moved things where the new ones grew, leaves `pieces` of them out, and trains the colours
+    of all that was looked at."""
     gmap, run = visit.gmap, visit.run
     membership = np.concatenate([gmap.membership[kept], np.ones(len(grown) - len(kept), np.float32)])
     membership[free] = np.where(made.ids >= 0, made.membership, 0)
     parts = gmap.parts["ids"] if "ids" in gmap.parts else np.full(len(gmap), -1, np.int32)
     part_ids = np.concatenate([parts[kept], np.full(len(grown) - len(kept), -1, np.int32)])
-    taken = {j for j, _ in pairs.values()}
+    taken = {j for j, _ in pairs.values()} | pieces
     used = [entry["id"] for entry in gmap.instances] + [p["id"] for e in gmap.instances for p in e.get("parts", ())]
     following, added = max(used, default=-1) + 1, dict[int, tuple[float, bool]]()
     for j, (rows, score) in enumerate(things):
@@ -241,7 +272,7 @@ def _settled(
             ids[rows], added[following] = following, (score, j in old)
             following += 1
     stays = np.setdiff1d(np.arange(len(grown)), _rows(things, taken))
-    pieces, names, members, owned = (
+    placed, names, members, owned = (
         [grown.rows(torch.from_numpy(stays))],
         [ids[stays]],
         [membership[stays]],
@@ -249,11 +280,11 @@ def _settled(
     )
     for i, (_, motion) in pairs.items():
         own = visit.rows_of(i)
-        pieces.append(carried(visit.thing(i), motion.new_from_old))
+        placed.append(carried(visit.thing(i), motion.new_from_old))
         names.append(np.full(len(own), i, np.int32))
         members.append(gmap.membership[own])
         owned.append(parts[own])
-    together = Gaussians.concatenate(pieces)
+    together = Gaussians.concatenate(placed)
     config = update_config(run.config, len(visit.photos.views), SETTLING, len(together))
     start = together.sh.clone()
     final, last = trained(

@@ -14,6 +14,7 @@ from perception.visits.evidence import mask_odds
 from perception.visits.look import Look
 
 CENTRE, RADIUS, SIZE, FOCAL = np.array([0.1, -0.05, 0.25]), 0.25, (90, 120), 130.0
+NONE = np.zeros((0, 3))
 ANGLES = np.radians(np.arange(0, 360, 36))
 
 
@@ -59,7 +60,7 @@ def photographed(angle: float, *, ball: bool = True) -> tuple[Look, np.ndarray]:
 
 def test_the_surface_of_a_ball_that_no_stereo_measured_is_found() -> None:
     looks, balls = zip(*(photographed(angle) for angle in ANGLES), strict=True)
-    found = carved_surface(looks, balls)
+    found = carved_surface(looks, balls, NONE)
     off = np.abs(np.linalg.norm(found.points - CENTRE, axis=1) - RADIUS)
     assert len(found.points) > 100 and np.median(off) < 0.02 and np.quantile(off, 0.9) < 0.06
     near = off < 0.02
@@ -71,17 +72,17 @@ def test_the_surface_of_a_ball_that_no_stereo_measured_is_found() -> None:
 
 def test_a_photo_whose_mask_is_missing_does_not_hide_the_ball() -> None:
     looks, balls = zip(*(photographed(angle) for angle in ANGLES), strict=True)
-    found = carved_surface(looks, [*balls[:-1], np.zeros(SIZE, bool)])
+    found = carved_surface(looks, [*balls[:-1], np.zeros(SIZE, bool)], NONE)
     off = np.abs(np.linalg.norm(found.points - CENTRE, axis=1) - RADIUS)
     assert len(found.points) > 60 and np.median(off) < 0.02
 
 
 def test_paint_on_the_floor_is_no_thing() -> None:
     looks, patches = zip(*(photographed(angle, ball=False) for angle in ANGLES), strict=True)
-    assert len(carved_surface(looks, patches).points) == 0
+    assert len(carved_surface(looks, patches, NONE).points) == 0
 
 
-@pytest.mark.parametrize("why", ["measured", "two photos", "nothing new", "blurred"])
+@pytest.mark.parametrize("why", ["measured", "known", "two photos", "nothing new", "blurred"])
 def test_where_nothing_is_carved(why: str) -> None:
     looks, balls = zip(*(photographed(angle) for angle in ANGLES), strict=True)
     if why == "measured":
@@ -95,7 +96,11 @@ def test_where_nothing_is_carved(why: str) -> None:
             replace(look, rendered=look.rendered / 5, product=look.product / 5, colour=np.full(SIZE, 0.06))
             for look in looks
         )
-    found = carved_surface(looks, balls)
+    known = NONE
+    if why == "known":  # as measured between other photos
+        normal = np.random.default_rng(0).normal(size=(1500, 3))
+        known = CENTRE + RADIUS * normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    found = carved_surface(looks, balls, known)
     assert len(found.points) == len(found.colors) == 0
 
 

@@ -5,13 +5,15 @@ python tools score.visits VISIT1 VISIT2 WORK [--masks labels|labels_sam|builtin]
 VISIT1 and VISIT2 are truth folders, as `worlds.visits` writes them; VISIT2 holds changes.json. The maps of both are
 made in WORK, and kept. Two tables: `update` of the first map; and the naive way, in which instances of the two maps are
 matched by place and size. An instance is the thing that it shares an IoU > .5 of true points with. A thing of which the
-second visit sees under 5 % is unseen; under 25 %, both its state and unseen are right.
+second visit sees under 5 % is unseen; under 25 %, both its state and unseen are right. Of a thing that went and one of
+the same name that came ("cactus", "cactus 25") nobody can tell that it did not move: that is right for both.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,6 +52,12 @@ class Truth:
         entries = {entry["id"]: entry for entry in listed if not entry["is_stuff"]}
         points, ids = ([cloud.points for cloud in clouds], [cloud.labels["instance_id"] for cloud in clouds])
         return cls((points[0], points[1]), (ids[0], ids[1]), entries)
+
+    def look_alikes(self) -> list[tuple[int, int]]:
+        """(one that came, one that went) of the same name, but for the number that `worlds.visits` adds."""
+        kinds = {i: re.sub(r" \d+$", "", entry["name"]) for i, entry in self.entries.items()}
+        states = {state: [i for i, e in self.entries.items() if e["state"] == state] for state in ("added", "removed")}
+        return [(new, old) for new in states["added"] for old in states["removed"] if kinds[new] == kinds[old]]
 
     def right(self, thing: int) -> tuple[str, set[str]]:
         """The true state of a thing, and all states that are right."""
@@ -91,17 +99,25 @@ def scores(changes: list[dict[str, Any]], first: Map, second: Map, truth: Truth)
     right, wrong, true = (dict.fromkeys(STATES, 0) for _ in range(3))
     alarms, lost, errors, kept, unchanged, unseen, blind = 0, 0, [], [], 0, 0, 0
     came, errant = [], []  # confidence and truth of what was told; what is wrong, in words
+    twins = {}  # of things that came, those that went and look the same, if they are said to stand there
+    for new, old in truth.look_alikes():
+        moved = said.get(before.get(old, -1), {}).get("state") == "moved"
+        if moved and before[old] == after.get(new) and old not in twins.values():
+            twins[new] = old
     for thing in truth.entries:
         state, allowed = truth.right(thing)
         if state == "added":
             if truth.entries[thing]["seen_in_visit2"] >= UNSEEN and (truth.ids[1] == thing).any():
                 true["added"] += 1
-                right["added"] += after.get(thing) in added
-                errant += [] if after.get(thing) in added else [f"{truth.entries[thing]['name']}: added, not said"]
+                found = after.get(thing) in added or thing in twins
+                right["added"] += found
+                errant += [] if found else [f"{truth.entries[thing]['name']}: added, not said"]
             continue
         if not (truth.ids[0] == thing).any():
             continue
         told = said.get(before.get(thing, -1), {"state": None})
+        if thing in twins.values():
+            told = {**told, "state": state}
         new_alarm = after.get(thing) in added
         wrong["added"] += new_alarm
         true[state] += not (told["state"] in allowed and told["state"] != state)
