@@ -12,6 +12,7 @@ from perception.gaussians.views import TrainingView
 from perception.visits.carving import carved_surface
 from perception.visits.evidence import mask_odds
 from perception.visits.look import Look
+from support.aimed import look_at
 
 CENTRE, RADIUS, SIZE, FOCAL = np.array([0.1, -0.05, 0.25]), 0.25, (90, 120), 130.0
 NONE = np.zeros((0, 3))
@@ -20,14 +21,7 @@ ANGLES = np.radians(np.arange(0, 360, 36))
 
 def pose(angle: float) -> np.ndarray:
     """camera_from_world of a camera 2 m away, which looks at the middle of the floor."""
-    centre = np.array([2 * np.cos(angle), 2 * np.sin(angle), 1.2])
-    z = -centre / np.linalg.norm(centre)
-    x = np.cross(z, [0, 0, 1.0])
-    x /= np.linalg.norm(x)
-    rotation = np.stack([x, np.cross(z, x), z])
-    result = np.eye(4)
-    result[:3, :3], result[:3, 3] = rotation, -rotation @ centre
-    return result
+    return look_at(np.array([2 * np.cos(angle), 2 * np.sin(angle), 1.2]), np.zeros(3), np.array([0, 0, 1.0]))
 
 
 def painted(points: np.ndarray) -> np.ndarray:
