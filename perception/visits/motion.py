@@ -56,6 +56,10 @@ ROUGH_STEP, STEP, LEAST_STEP = 0.4, 0.1, 0.03
 LOOKS = 8.0, 0.45
 """Log-odds of being one thing per unit of what two histograms have in common, and where that says nothing: the same
 things share .5 to .75 between visits, others up to .5."""
+HUES = -35.0, 0.07
+"""Log-odds of being one thing per unit of difference between the shares of red, green and blue in its colours and in
+the photos', and where that says nothing. In made scenes nine tenths of 91 true pairs have less than .06, and of 64 of
+other colours more than .08."""
 CLOSE = 1.5
 """Log-odds within which two motions, or two look-alikes, cannot be told apart."""
 WITHIN = 0.25
@@ -132,6 +136,22 @@ class Cut:
         depths = np.where(alphas > VISIBLE, out.depths.numpy() / np.maximum(alphas, 1e-6), np.inf)
         return out.colors, alphas, depths
 
+    def _before_all(self, thing: Gaussians, motions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """With a thing after each of the motions [P, 4, 4] before all else, the nearer of two surfaces being seen:
+        colours [P, h, w, 3] and depths [P, h, w], float32, and where the thing is seen [P, h, w]."""
+        view, (colors, alphas, depths) = self.view, self._drawn(thing, motions)
+        fronts = depths < self.depth * (1 + TOUCHING)
+        own = np.where(fronts[..., None], view.exposed(colors).numpy(), 0)
+        images = own + (1 - np.where(fronts, alphas, 0)[..., None]) * self.image
+        mapped = np.where(fronts, depths, np.where(np.isfinite(self.depth), self.depth, 0)).astype(np.float32)
+        shown = fronts if view.weight is None else fronts & (view.weight.numpy() > 0)
+        return images.clip(0, 1).astype(np.float32), mapped, shown
+
+    def colours(self, thing: Gaussians, motion: np.ndarray) -> np.ndarray:
+        """[2, 3] sums of the colours of a thing after a motion where it is seen, and of those of the photo there."""
+        (image,), _, (shown,) = self._before_all(thing, motion[None])
+        return np.stack([image[shown].sum(axis=0), self._photo[0][shown].sum(axis=0)]).astype(np.float64)
+
     def within(self, thing: Gaussians, motion: np.ndarray, smallest: float) -> np.ndarray:
         """[2] pixels of a thing after a motion: all, and those behind the surface of all else by less than its least
         extent `smallest`."""
@@ -140,16 +160,9 @@ class Cut:
         return np.array([np.isfinite(depth).sum(), (behind & np.isfinite(depth)).sum()])
 
     def sums(self, thing: Gaussians, motions: np.ndarray, smallest: float) -> np.ndarray:
-        """[P, 11] of `evidence.sums_in`, of a thing after each of the motions [P, 4, 4] before all else: the nearer of
-        two surfaces is seen. smallest: its least extent."""
+        """[P, 11] of `evidence.sums_in`, of a thing after each of the motions [P, 4, 4]. smallest: its least extent."""
         photo, gray, mean, variance = self._photo
-        view, (colors, alphas, depths) = self.view, self._drawn(thing, motions)
-        fronts = depths < self.depth * (1 + TOUCHING)
-        own = np.where(fronts[..., None], view.exposed(colors).numpy(), 0)
-        images = own + (1 - np.where(fronts, alphas, 0)[..., None]) * self.image
-        images = images.clip(0, 1).astype(np.float32)
-        mapped = np.where(fronts, depths, np.where(np.isfinite(self.depth), self.depth, 0)).astype(np.float32)
-        shown = fronts if view.weight is None else fronts & (view.weight.numpy() > 0)
+        view, (images, mapped, shown) = self.view, self._before_all(thing, motions)
         colour = np.abs(images - photo).mean(axis=3)
         rows = []
         for n, image in enumerate(images @ GRAY):
@@ -288,8 +301,16 @@ def settled(
     ambiguous = any(other.same > signs.same - CLOSE for other, _ in others)
     if axis is None and not ambiguous and signs.correlation < SURE:
         ambiguous = signs.correlation < UNLIKE or other_sides(old, pose, cuts, up, depth, seen)
-    odds = signs.same + LOOKS[0] * (alike - LOOKS[1])
+    odds = signs.same + LOOKS[0] * (alike - LOOKS[1]) + hue_odds(old, pose, cuts)
     return Motion(pose, odds, ambiguous, axis)
+
+
+def hue_odds(old: Gaussians, pose: np.ndarray, cuts: Sequence[Cut]) -> float:
+    """Log-odds that an old thing is the one that photos show after the motion `pose`, by their hues: a mean over all
+    pixels is known better than the colour of each, and brightness, which light changes, is left out."""
+    sums = np.sum([cut.colours(old, pose) for cut in cuts], axis=0)
+    totals = sums.sum(axis=1, keepdims=True)
+    return HUES[0] * (float(np.abs(np.subtract(*(sums / totals))).sum()) - HUES[1]) if totals.all() else 0.0
 
 
 def round_about(old: Gaussians, motion: Found, cuts: Sequence[Cut], up: np.ndarray, depth: float) -> np.ndarray | None:

@@ -119,6 +119,7 @@ def seen_today(visit: Visit) -> Today:
     things = _apart(things, grown.means.double().numpy(), whole, run.config.instances.min_cluster_size)
     with run.stage("motion"):
         pieces = _pieces(visit, grown, things, whole)
+    pairs = {i: (j, motion) for i, (j, motion) in pairs.items() if j not in pieces}
     return _settled(visit, grown, kept, ids, made, free, signs, gone, things, old, pairs, pieces, record)
 
 
@@ -230,20 +231,21 @@ def _apart(
 def _pieces(
     visit: Visit, grown: Gaussians, things: list[tuple[np.ndarray, float]], whole: dict[int, Gaussians]
 ) -> set[int]:
-    """Numbers of the things that are pieces of a moved one, as masks may cut the legs off a chair: they lie along it as
-    it stands now (`whole`, by number), and the photos show as well without them what they show."""
+    """Numbers of the things that are pieces of another that moved, as masks may cut the legs off a chair: they lie
+    along it as it stands now (`whole`, by number), and the photos show as well without them what they show."""
     from scipy.spatial import cKDTree
 
     means, stays = grown.means.double().numpy(), np.setdiff1d(np.arange(len(grown)), _rows(things, set(whole)))
     found = set[int]()
     for j, (rows, _) in enumerate(things):
-        reach = [(cKDTree(p.points).query(means[rows])[0], p.radius) for p in map(Points.of, whole.values())]
-        if j in whole or all(np.quantile(away, ALONG[0]) > ALONG[1] * radius for away, radius in reach):
+        others = [thing for k, thing in whole.items() if k != j and k not in found]
+        reach = [(cKDTree(p.points).query(means[rows])[0], p.radius) for p in map(Points.of, others)]
+        if all(np.quantile(away, ALONG[0]) > ALONG[1] * radius for away, radius in reach):
             continue
         ids = np.full(len(grown), -1, np.int32)
         ids[rows] = j
         shown = visit.looks(grown, ids)
-        without = Gaussians.concatenate([grown.rows(torch.from_numpy(np.setdiff1d(stays, rows))), *whole.values()])
+        without = Gaussians.concatenate([grown.rows(torch.from_numpy(np.setdiff1d(stays, rows))), *others])
         looks = visit.looks(without, np.full(len(without), -1, np.int32))
         looks = [replace(look, ids=with_it.ids) for look, with_it in zip(looks, shown, strict=True)]
         (signs,) = signs_of(looks, [j], np.ones(1), np.full(1, np.inf))

@@ -17,7 +17,7 @@ from perception.gaussians.views import TrainingView, render
 from perception.instances.group import Grouping
 from perception.types import View
 from perception.visits.look import seen_from
-from perception.visits.motion import Cut, _upright_starts, assigned, judged, other_sides, refined
+from perception.visits.motion import HUES, Cut, _upright_starts, assigned, hue_odds, judged, other_sides, refined
 from perception.visits.registration import Points, angle_between, carried, compact, looks_round, register
 from perception.visits.today import _apart, _without_fragments
 from support.aimed import look_at
@@ -123,6 +123,25 @@ def test_a_motion_is_refined_to_the_one_that_the_photos_show() -> None:
     found = refined(gaussians, judged(gaussians, [start], cuts, 0.06)[0], cuts, 0.06, 0.1, 0.03)
     assert found[0].same > judged(gaussians, [start], cuts, 0.06)[0][0].same + 1
     assert angle_between(found[1], true) < 2 and np.linalg.norm((found[1] - true)[:3, 3]) < 0.003
+
+
+@pytest.mark.parametrize("light", [1.0, 0.6])
+@pytest.mark.parametrize("shown", [(0.2, 0.3, 0.5), (0.45, 0.2, 0.45), (0.5, 0.5, 0.5)])
+def test_the_hue_of_a_thing_is_compared_whatever_its_brightness(shown: tuple[float, ...], light: float) -> None:
+    """Things of one colour before black: the shares of red, green and blue are those of the colours."""
+    generator, true = torch.Generator().manual_seed(1), motion(40.0, (0.1, 0.05, 0.0))
+    points, sizes = thing(np.random.default_rng(4), 500).points, torch.full((500,), -4.6)
+
+    def painted(color: Sequence[float]) -> Gaussians:
+        return isotropic(points, sizes, torch.tensor(color).expand(500, 3), 0.9, 2, generator)
+
+    old = (0.2, 0.3, 0.5)
+    cuts = photographed(painted([light * c for c in shown]), true, ((0.6, 0.1, 0.4), (-0.3, 0.5, 0.4)))
+    differ = sum(abs(a / sum(old) - b / sum(shown)) for a, b in zip(old, shown, strict=True))
+    # Photos have 8 bits, cut off: up to 1/255 of each colour.
+    assert hue_odds(painted(old), true, cuts) == pytest.approx(HUES[0] * (differ - HUES[1]), abs=-HUES[0] * 0.02)
+    away = motion(0.0, (9.0, 9.0, 0.0))
+    assert hue_odds(painted(old), away, cuts) == 0.0, "where no photo looks nothing is known"
 
 
 def test_another_turn_is_excluded_only_where_the_sides_that_it_would_show_were_seen() -> None:

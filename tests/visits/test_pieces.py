@@ -1,0 +1,64 @@
+"""Pieces of a moved thing that grew apart from it, in photos rendered from what truly stands there."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+import torch
+
+from perception.gaussians.model import Gaussians, isotropic
+from perception.gaussians.views import TrainingView, render
+from perception.visits.look import Look, look
+from perception.visits.today import _pieces
+from perception.visits.visit import Visit
+from support.aimed import look_at
+
+K, SIDE = torch.tensor([[110.0, 0, 48], [0, 110, 48], [0, 0, 1]]), 96
+
+
+def block(low: tuple[float, ...], high: tuple[float, ...], seed: int, count: int = 400) -> Gaussians:
+    """A box full of small balls, each of its own colour."""
+    rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
+    points, colors = rng.uniform(low, high, (count, 3)), torch.rand(count, 3, generator=generator)
+    return isotropic(points, torch.full((count,), -4.2), colors, 0.9, 2, generator)
+
+
+CHAIR = block((-0.1, -0.1, 0), (0.1, 0.1, 0.3), 1)
+LEG = CHAIR.means.numpy()[:, 0] > 0.05
+"""The part of the chair that grew apart from it."""
+BOX = block((0.1, -0.1, 0), (0.13, 0.1, 0.3), 2)
+"""What stood elsewhere, and would fit beside the chair."""
+
+
+def visit_of(truth: Gaussians) -> Visit:
+    """A visit whose photos show `truth`, from all sides."""
+    views = []
+    for angle in np.arange(6):
+        eye = np.array([0.7 * np.cos(angle), 0.7 * np.sin(angle), 0.5])
+        camera = torch.from_numpy(look_at(eye, np.array([0, 0, 0.15]), np.array([0, 0, 1.0])).astype(np.float32))
+        image = render(truth, camera, K, SIDE, SIDE, harmonics=True).colors[0]
+        views.append(TrainingView("a", (image.clamp(0, 1) * 255).to(torch.uint8), None, K, camera))
+    nothing = np.zeros((SIDE, SIDE), np.float32)
+
+    def looks(gaussians: Gaussians, ids: np.ndarray) -> list[Look]:
+        return [look(gaussians, ids, view, nothing) for view in views]
+
+    return cast(Visit, SimpleNamespace(looks=looks))
+
+
+@pytest.mark.parametrize("paired", [False, True])
+def test_a_leg_is_a_piece_of_the_chair_also_where_it_was_taken_for_a_box(paired: bool) -> None:
+    things = [(np.flatnonzero(~LEG), 0.9), (np.flatnonzero(LEG), 0.6)]
+    whole = {0: CHAIR} | ({1: BOX} if paired else {})
+    assert _pieces(visit_of(CHAIR), CHAIR, things, whole) == {1}
+
+
+@pytest.mark.parametrize("paired", [False, True])
+def test_a_box_beside_the_chair_that_the_photos_show_is_none(paired: bool) -> None:
+    grown = Gaussians.concatenate([CHAIR, BOX])
+    things = [(np.arange(400), 0.9), (np.arange(400, 800), 0.9)]
+    whole = {0: CHAIR} | ({1: BOX} if paired else {})
+    assert _pieces(visit_of(grown), grown, things, whole) == set()
