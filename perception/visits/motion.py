@@ -39,12 +39,10 @@ HOPELESS = -4.0
 """Log-odds of a first guess below which a motion is not refined."""
 ALIKE = 2
 """Old things, most alike in colour, with which a new one is compared."""
-CERTAIN = 4.0
+CERTAIN = 6.0
 """Log-odds of a motion from which no other thing is tried, unless that is as much alike."""
 TWINS = 0.15
 """Difference of what two histograms have in common, within which two things are as much alike."""
-MOVED = 1.2
-"""Least log-odds for which a new thing is an old one."""
 GAINS, SHORTER = 0.1, 3
 """Log-odds below which a gain of refinement makes its steps shorter, and how much."""
 BEHIND = 5.0
@@ -58,8 +56,8 @@ LOOKS = 8.0, 0.45
 things share .5 to .75 between visits, others up to .5."""
 HUES = -35.0, 0.07
 """Log-odds of being one thing per unit of difference between the shares of red, green and blue in its colours and in
-the photos', and where that says nothing. In made scenes nine tenths of 91 true pairs have less than .06, and of 64 of
-other colours more than .08."""
+the photos', and where that says nothing. Of pairs that were compared in made scenes, 134 of 142 right ones have
+positive log-odds, and 4 of 88 wrong ones that are no look-alikes."""
 CLOSE = 1.5
 """Log-odds within which two motions, or two look-alikes, cannot be told apart."""
 WITHIN = 0.25
@@ -387,10 +385,10 @@ def refined(old: Gaussians, start: Found, cuts: Sequence[Cut], depth: float, ste
     return best
 
 
-def assigned(odds: np.ndarray, least: float = 0.0) -> list[tuple[int, int]]:
-    """Pairs (old, new) of the joint assignment with the largest sum of log-odds [O, N] above `least`."""
+def assigned(odds: np.ndarray) -> list[tuple[int, int]]:
+    """Pairs (old, new) of the joint assignment with the largest sum of positive log-odds [O, N]."""
     from scipy.optimize import linear_sum_assignment
 
-    gain = np.maximum(np.where(np.isfinite(odds), odds - least, 0), 0)
+    gain = np.maximum(np.where(np.isfinite(odds), odds, 0), 0)
     rows, columns = linear_sum_assignment(-gain)
     return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if gain[i, j] > 0]

@@ -30,7 +30,6 @@ from perception.visits.motion import (
     CLOSE,
     HOPELESS,
     LOOKS,
-    MOVED,
     TWINS,
     Motion,
     assigned,
@@ -206,7 +205,7 @@ def _moved(
                 odds[a, j], motions[a, j] = motion.odds, motion
         visit.run.progress.update("motions", j + 1, len(things))
     pairs = {}
-    for a, j in assigned(odds, MOVED):
+    for a, j in assigned(odds):
         rivals = np.concatenate([np.delete(odds[:, j], a), np.delete(odds[a], j)])
         unsure = rivals.max(initial=-np.inf) > odds[a, j] - CLOSE
         pairs[gone[a]] = (j, replace(motions[a, j], ambiguous=motions[a, j].ambiguous or bool(unsure)))

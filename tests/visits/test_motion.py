@@ -218,9 +218,9 @@ def test_pairs_have_the_largest_sum_of_log_odds() -> None:
     for _ in range(20):
         odds = rng.normal(0, 3, (4, 4))
         odds[rng.random((4, 4)) < 0.3] = -np.inf
-        best = max(sum(max(0.0, odds[i, j] - 1) for i, j in enumerate(order)) for order in permutations(range(4)))
-        pairs = assigned(odds, 1.0)
-        assert np.isclose(sum(odds[i, j] - 1 for i, j in pairs), best) and all(odds[i, j] > 1 for i, j in pairs)
+        best = max(sum(max(0.0, odds[i, j]) for i, j in enumerate(order)) for order in permutations(range(4)))
+        pairs = assigned(odds)
+        assert np.isclose(sum(odds[i, j] for i, j in pairs), best) and all(odds[i, j] > 0 for i, j in pairs)
 
 
 def test_what_is_out_of_reach_of_a_moved_thing_is_a_thing_of_its_own() -> None:
