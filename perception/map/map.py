@@ -141,6 +141,7 @@ class Map:
     path: Path | None = None
     files: MapFiles | None = None
     _warned: bool = field(default=False, init=False)
+    _id: str = field(default="unsaved", init=False)
 
     @classmethod
     def open(cls: type[M], path: Path, **fields: Any) -> M:
@@ -162,7 +163,7 @@ class Map:
         """Reads all fields now and closes the files."""
         for name in _FIELDS:
             getattr(self, name)
-        self.files = None
+        self._id, self.files = self.map_id, None
         return self
 
     def __len__(self) -> int:
@@ -193,8 +194,8 @@ class Map:
 
     @property
     def map_id(self) -> str:
-        """Short identifier of the map and its labels; it changes when either changes."""
-        return "unsaved" if self.files is None else self.files.map_id
+        """Short identifier of the map and its labels on disk; it changes when either changes. "unsaved" without one."""
+        return self._id if self.files is None else self.files.map_id
 
     @property
     def newest_visit(self) -> int:

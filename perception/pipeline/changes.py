@@ -16,11 +16,16 @@ from perception.errors import InputError
 from perception.inputs.load import input_files
 from perception.io.atomic import write_file
 from perception.io.documents import read_json, refusing
+from perception.map.checksums import is_map
+from perception.map.files import read_info
+from perception.map.map import Map
+from perception.map.write import read_map
 from perception.masks.sam_models import sam_graphs
 from perception.onnx.sessions import side_files
 from perception.onnx.store import resolve
 from perception.photos.folder import list_photos
-from perception.pipeline.checkpoint import INPUTS, frames_folder, work_folder
+from perception.pipeline.checkpoint import INPUTS, clear_work, frames_folder, work_folder
+from perception.progress import Progress
 
 CONFIGURATIONS = (
     *("config.json", "tokenizer.json", "tokenizer_config.json"),
@@ -107,6 +112,16 @@ def hold_inputs(work: Path, source: Path, config: MapConfig, output: Path) -> In
     _compare(work, {key: before[key] for key in both}, {key: now[key] for key in both}, "since this run began", todo)
     write_file(file, json.dumps({**before, **now}))
     return now
+
+
+def finished(source: Path, output: Path, config: MapConfig, mark: str, progress: Progress) -> Map | None:
+    """The finished map whose fingerprint is `mark`, if any. InputError when its input files have changed since."""
+    if not is_map(output) or (info := read_info(output)).get("fingerprint") != mark:
+        return None
+    refuse_changed(output, info, inputs_of(source, config, output))
+    progress.log(f"{output}: this run is finished")
+    clear_work(output)
+    return read_map(output)
 
 
 def refuse_changed(output: Path, info: dict[str, Any], now: Inputs) -> None:

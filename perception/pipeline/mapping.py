@@ -19,16 +19,14 @@ from perception.inputs.load import load_scene
 from perception.language.base import Encoder
 from perception.language.ocr import TextReader, make_reader
 from perception.machine import return_free_memory
-from perception.map.checksums import is_map
-from perception.map.files import read_info
-from perception.map.write import Map, read_map, write_map
+from perception.map.write import Map, write_map
 from perception.masks import MaskSource, make_source
 from perception.masks.compute import load_segmentation
 from perception.photos.scene_file import load_saved_scene, save_scene
 from perception.photos.view_json import stored_view
 from perception.pipeline.blocks import optimiser
-from perception.pipeline.changes import hold_inputs, inputs_of, refuse_changed
-from perception.pipeline.checkpoint import check_name, clear_work, fingerprint, frames_folder, poses_mark, working
+from perception.pipeline.changes import finished, hold_inputs
+from perception.pipeline.checkpoint import check_name, fingerprint, frames_folder, poses_mark, working
 from perception.pipeline.estimate import log_estimate
 from perception.pipeline.instances import DescribedInstances, describe, group_gaussians
 from perception.pipeline.optimise import Optimised, Run
@@ -61,8 +59,8 @@ def build_map(
     (12, True)
     """
     check_name(output)
-    if resume and (finished := _finished(source, output, config, progress)) is not None:
-        return finished
+    if resume and (made := finished(source, output, config, fingerprint(source, config), progress)) is not None:
+        return made
     with working(source, output, resume) as work:
         # Files, models and devices are opened first, so that errors appear before hours of work.
         hold_inputs(work, source, config, output)
@@ -99,16 +97,6 @@ def build_map(
 
 
 # ----------------------------------------------------------------------- stages
-
-
-def _finished(source: Path, output: Path, config: MapConfig, progress: Progress) -> Map | None:
-    """The finished map of this input and these settings, if any. InputError when the input has changed since."""
-    if not is_map(output) or (info := read_info(output)).get("fingerprint") != fingerprint(source, config):
-        return None
-    refuse_changed(output, info, inputs_of(source, config, output))
-    progress.log(f"{output}: this run is finished")
-    clear_work(output)
-    return read_map(output)
 
 
 def _open_run(source: Path, config: MapConfig, work: Path, progress: Progress, engine: Engine) -> Run:

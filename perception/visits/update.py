@@ -25,14 +25,12 @@ from perception.gaussians.model import Nearby
 from perception.instances.group import Grouping
 from perception.language.base import Encoder
 from perception.language.ocr import make_reader
-from perception.map.checksums import is_map
-from perception.map.files import read_info
 from perception.map.history import is_removed
 from perception.map.write import Map, read_map, write_map
 from perception.masks import make_source
 from perception.photos.view_json import StoredView, moved_record, stored_view
-from perception.pipeline.changes import hold_inputs
-from perception.pipeline.checkpoint import check_name, clear_work, digest, fingerprint, working
+from perception.pipeline.changes import finished, hold_inputs
+from perception.pipeline.checkpoint import check_name, digest, fingerprint, working
 from perception.pipeline.instances import DescribedInstances, describe
 from perception.pipeline.optimise import Optimised, Run
 from perception.pipeline.record import finite, score_views
@@ -69,10 +67,8 @@ def update_map(
     check_name(output)
     gmap = read_map(path)
     mark = digest(gmap.map_id, fingerprint(source, config))
-    if resume and is_map(output) and read_info(output).get("fingerprint") == mark:
-        progress.log(f"{output}: this run is finished")
-        clear_work(output)
-        return read_map(output)
+    if resume and (made := finished(source, output, config, mark, progress)) is not None:
+        return made
     with working(source, output, resume) as work:
         hold_inputs(work, source, config, output)
         device, notice = choose_device(config.device)

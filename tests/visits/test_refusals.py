@@ -11,10 +11,16 @@ import pytest
 import torch
 from PIL import Image
 
+from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.views import TrainingView
+from perception.map.write import read_map, set_labels, write_map
+from perception.pipeline.changes import inputs_of
+from perception.pipeline.checkpoint import digest, fingerprint
 from perception.visits.look import Look
 from perception.visits.scene import foreign_photos, refuse_older
+from perception.visits.update import update_map
+from support.visited_map import number, write_visited_map
 
 TAKEN = 0x9003  # EXIF DateTimeOriginal
 
@@ -58,3 +64,22 @@ def test_depth_in_another_unit_is_refused(tmp_path: Path) -> None:
     assert foreign_photos(tmp_path, a_map([]), [look(1.0)]) == []
     with pytest.raises(InputError, match="another unit: its depth images measure 1e"):
         foreign_photos(tmp_path, a_map([]), [look(1000.0)])
+
+
+def test_a_finished_update_is_that_of_the_same_photos_and_the_same_map(tmp_path: Path) -> None:
+    """Else `resume` would return the map of other photos, or one without the names given since."""
+    old, new, source, config = tmp_path / "old.gsmap", tmp_path / "new.gsmap", tmp_path / "photos", MapConfig()
+    source.mkdir()
+    photo(source / "a.jpg", None)
+    write_visited_map(old)
+    made = read_map(old)
+    mark = digest(made.map_id, fingerprint(source, config))
+    made.info |= {"fingerprint": mark, "inputs": inputs_of(source, config, new)}
+    write_map(new, made)
+    assert update_map(old, source, new, config, resume=True).info["fingerprint"] == mark
+    photo(source / "a.jpg", "2026:11:24 10:00:00")
+    with pytest.raises(InputError, match=r"others since this map was made.*a\.jpg"):
+        update_map(old, source, new, config, resume=True)
+    set_labels(old, {number("lamp"): "reading lamp"})
+    with pytest.raises(InputError, match="exists already"):
+        update_map(old, source, new, config, resume=True)
