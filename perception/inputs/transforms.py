@@ -122,10 +122,20 @@ def read_frames(file: Path) -> list[tuple[str, np.ndarray, Lens]]:
     return [(str(values["file_path"]), _pose(file, values), _lens(file, values, None)) for values in frames]
 
 
-def in_map_frame(file: Path) -> bool:
-    """Whether its poses are in the frame of a map, as `perception localise` writes them, not in that of an input."""
+def in_map_frame(file: Path, info: dict[str, Any]) -> bool:
+    """Whether its poses are in the frame of a map, as `perception localise` writes them, not in that of an input.
+    info: of map.json. InputError where the map has had another unit then."""
     data = read_json(file)
-    return isinstance(data, dict) and "map_id" in data
+    if not isinstance(data, dict) or "map_id" not in data:
+        return False
+    if any(key in data and data[key] != value for key, value in unit_of(info).items()):
+        raise InputError(f"{file}: its poses are in another unit than the map has now; run perception localise again")
+    return True
+
+
+def unit_of(info: dict[str, Any]) -> dict[str, Any]:
+    """What `in_map_frame` compares: what map.json tells of the unit."""
+    return {"metric": info.get("metric", False), "scale": info.get("scale")}
 
 
 def lens_values(lens: Lens) -> dict[str, Any]:

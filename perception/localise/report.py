@@ -9,6 +9,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from perception.errors import InputError
+from perception.inputs.load import input_files
+from perception.inputs.transforms import unit_of
 from perception.io.atomic import atomic_file
 from perception.localise.localiser import Localised, Localiser, NotHere
 from perception.localise.photos import new_photos, transforms_of
@@ -27,7 +29,8 @@ def localise_photos(
     gmap = Map.open(path)
     with TemporaryDirectory(prefix="perception-localise-") as workdir:
         new = new_photos(sources, camera, Path(workdir), show)
-    refuse_inputs([output], [path, camera, *sources, *(photo.photo for photo in new)])
+    listed = [file for source in sources if source.is_dir() for file in input_files(source)]
+    refuse_inputs([output], [path, camera, *sources, *listed, *(photo.photo for photo in new)])
     localiser = Localiser(gmap, photos, show)
     answers = localiser.answers(new)
     facts = {"photos": [answer_json(answer) for answer in answers], "frame": gmap.frame, "metric": gmap.metric}
@@ -35,7 +38,7 @@ def localise_photos(
     found = [answer for answer in answers if isinstance(answer, Localised)]
     if output is not None and found:
         depths = {photo.name: photo.depth for photo in new}
-        head = {"map_id": gmap.map_id, "frame": gmap.frame, "metric": gmap.metric}
+        head = {"map_id": gmap.map_id, "frame": gmap.frame, **unit_of(gmap.info)}
         with atomic_file(output) as aside:
             aside.write_text(json.dumps(transforms_of(found, depths, output, head), indent=1) + "\n", encoding="utf-8")
     return facts, _lines(answers, gmap, localiser.rendered)

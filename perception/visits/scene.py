@@ -76,7 +76,7 @@ def visit_scene(run: Run, gmap: Map, output: Path) -> Scene:
     if not scene.views:
         raise InputError(f"{source}: holds no posed photo; give photos of a new visit")
     placed = source / "transforms.json" if source.is_dir() else source
-    if placed.suffix == ".json" and placed.is_file() and in_map_frame(placed):
+    if placed.suffix == ".json" and placed.is_file() and in_map_frame(placed, gmap.info):
         return scene
     return replace(scene, views=[moved(view, b_from_a) for view in scene.views])
 

@@ -14,14 +14,17 @@ import pytest
 
 import perception
 from perception.cli import main
-from perception.inputs.transforms import in_map_frame, lens_values, read_frames
+from perception.errors import InputError
+from perception.inputs.transforms import in_map_frame, lens_values, read_frames, unit_of
 from perception.map.files import MapFiles
+from perception.map.map import Map
 from perception.map.write import read_map, write_map
 from perception.photos.lens import camera_from_lens
 from perception.types import Lens
 from support.painted_room import PaintedRoom, difference, walk, write_room_map
 
 TRUTH = walk(1, 4, 0.15)[1:3]
+LENS = Lens("PINHOLE", (150.0, 150.0, 100.0, 75.0), 200, 150)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +51,7 @@ def test_poses_as_json_and_as_a_file_in_the_maps_frame(folder: Path, capsys: pyt
     ]  # fmt: skip
     assert (facts["frame"], facts["metric"], facts["rendered"]) == ("map", True, [])
     frames = read_frames(folder / "out.json")
-    assert in_map_frame(folder / "out.json") and [name for name, _, _ in frames] == ["new/0.png", "new/1.png"]
+    assert in_map_frame(folder / "out.json", facts) and [name for name, _, _ in frames] == ["new/0.png", "new/1.png"]
     for photo, (_, pose, lens), truth in zip(facts["photos"], frames, TRUTH, strict=False):
         assert np.allclose(pose, photo["camera_from_map"]) and lens.params[0] == 300
         assert difference(pose, truth)[0] < 0.003
@@ -95,7 +98,10 @@ def test_what_cannot_be_used_is_told_in_one_line(
     (tmp_path / "broken.png").write_bytes(b"no picture")
     (tmp_path / "video.mp4").write_bytes(b"")
     (tmp_path / "empty").mkdir()
-    photo = folder / "new/0.png"
+    photo, poses = folder / "new/0.png", tmp_path / "posed" / "transforms.json"
+    shutil.copytree(folder / "new", tmp_path / "posed")
+    frame = {"file_path": "0.png", "transform_matrix": np.eye(4).tolist(), **lens_values(LENS)}
+    poses.write_text(json.dumps({"frames": [frame]}))
     for arguments, word in (
         ([folder / "other"], "elsewhere.png: not in this map"),
         ([tmp_path / "broken.png"], "broken.png"),
@@ -104,13 +110,14 @@ def test_what_cannot_be_used_is_told_in_one_line(
         ([tmp_path / "empty"], "no photos found"),
         ([photo, "-o", photo], "write to another file"),
         ([photo, "-o", folder / "photos/0.png"], "write to another file"),
+        ([tmp_path / "posed", "-o", poses], "write to another file"),
         ([photo, "--photos", tmp_path / "nowhere"], "is no folder"),
         ([photo, "--camera", tmp_path / "nowhere.yaml"], "nowhere.yaml"),
     ):
         assert main(["localise", str(folder / "a.gsmap"), *map(str, arguments)]) == 2
         lines = capsys.readouterr().err.strip().splitlines()
         assert word in lines[-1] and lines[-1].startswith("error: ")
-    assert MapFiles(folder / "a.gsmap").map_id == before
+    assert MapFiles(folder / "a.gsmap").map_id == before and json.loads(poses.read_text()) == {"frames": [frame]}
     assert main(["localise", str(folder / "a.gsmap"), str(folder / "other"), "--json"]) == 2
     assert json.loads(capsys.readouterr().out)["photos"][0]["localised"] is False
 
@@ -122,7 +129,7 @@ def test_rendering_takes_such_a_file_as_in_the_maps_frame(folder: Path, tmp_path
     far[0, 3] = 1000.0
     gmap.info["map_from_input"] = far.tolist()
     write_map(tmp_path / "a.gsmap", gmap)
-    frame = {"file_path": "a.png", **lens_values(Lens("PINHOLE", (150.0, 150.0, 100.0, 75.0), 200, 150))}
+    frame = {"file_path": "a.png", **lens_values(LENS)}
     frame["transform_matrix"] = (np.linalg.inv(TRUTH[0]) @ np.diag([1.0, -1, -1, 1])).tolist()
     for name, head in (("of_map", {"map_id": gmap.map_id}), ("of_input", {})):
         (tmp_path / f"{name}.json").write_text(json.dumps({**head, "frames": [frame]}))
@@ -130,6 +137,17 @@ def test_rendering_takes_such_a_file_as_in_the_maps_frame(folder: Path, tmp_path
         assert main(["render", str(tmp_path / "a.gsmap"), *arguments]) == 0
     seen = {name: cv2.imread(str(tmp_path / name / "a.png")).max() for name in ("of_map", "of_input")}
     assert seen["of_map"] > 100 and seen["of_input"] == 0
+
+
+def test_poses_in_the_map_before_it_was_scaled_are_refused(folder: Path, tmp_path: Path) -> None:
+    """They would be taken for poses in its new unit."""
+    gmap, poses = Map.open(folder / "a.gsmap"), tmp_path / "poses.json"
+    for scale, again in ((None, {"metric": False}), ({"metres_per_unit": 1.0}, {"scale": None})):
+        info = {**gmap.info, "scale": scale}
+        poses.write_text(json.dumps({"map_id": "before", **unit_of(info), "frames": []}))
+        assert in_map_frame(poses, info)
+        with pytest.raises(InputError, match="another unit"):
+            in_map_frame(poses, {**info, **again})
 
 
 @pytest.mark.parametrize(
