@@ -68,7 +68,7 @@ class Visit:
 
 def visits_of(info: dict[str, Any], photos: int = 0) -> list[Visit]:
     """The visits of a map, oldest first; info: of `Map`; photos: of a map that lists no visits, which has one."""
-    only = {"time": None, "input": info.get("scene", {}).get("input") or info.get("source", ""), "photos": photos}
+    only = {"time": None, "input": info.get("source", ""), "photos": photos}
     return [Visit(n, v["time"], v["input"], v["photos"]) for n, v in enumerate(info.get("visits") or [only])]
 
 

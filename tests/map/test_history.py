@@ -13,7 +13,7 @@ from perception.cli import main
 from perception.edit.editor import Editor
 from perception.edit.scale import scaled
 from perception.errors import InputError
-from perception.map.history import Visit, change_in, changes_of, date_of
+from perception.map.history import Visit, change_in, changes_of, date_of, visits_of
 from perception.map.map import Map
 from perception.map.write import read_map, write_map
 from perception.query import QueryMap, load_map
@@ -218,3 +218,9 @@ def test_a_round_thing_keeps_the_axis_of_its_unknown_turn_in_every_frame() -> No
     a_from_b = np.array([[2.0, 0, 0, 1], [0, 0, -2, 0], [0, 2, 0, 0], [0, 0, 0, 1]])  # x stays, z becomes −y
     moved = change_in(a_from_b, change)
     assert moved["axis"] == pytest.approx([0, -1, 0]) and moved["old_centroid"] == [3.0, 0, 0]
+
+
+def test_a_map_of_one_visit_has_the_path_of_its_input() -> None:
+    """`scene.input` is the kind of it."""
+    info = {"source": "/home/me/photos", "scene": {"input": "transforms"}}
+    assert visits_of(info, 7) == [Visit(0, None, "/home/me/photos", 7)]
