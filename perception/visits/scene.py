@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from perception.config import MapConfig, fields, flat, load_config
+from perception.config import MapConfig, fields, flat, load_config, read_pairs
 from perception.errors import InputError
 from perception.frame.recentre import map_from_input, moved
 from perception.geometry import move_points
@@ -20,7 +20,9 @@ from perception.localise.photos import new_photos
 from perception.localise.report import rendered_notice
 from perception.map.files import read_info
 from perception.map.map import Map
+from perception.photos.decode import why_left_out
 from perception.photos.folder import VIDEO_SUFFIXES
+from perception.photos.ignore_masks import mask_of, with_checked_masks
 from perception.photos.video import video_frames
 from perception.photos.views import make_view
 from perception.pipeline.checkpoint import frames_folder
@@ -38,13 +40,18 @@ LEAST_SHARE = 0.8
 """Share of the photos that must show the map; a few that do not are left out."""
 OF_INPUT = ("photos.camera", "photos.ignore_masks", "photos.init_points", "photos.held_out", "frame.", "device")
 """Settings, or groups of them, that belong to the input of a map and not to those of its visits."""
+OF_MAP = ("photos.init_points", "photos.poses", "frame.", "splat.")
+"""Those that an update does not use: it keeps the frame, the unit, and the poses of its input."""
 OTHER_UNIT = 1.5
 """Factor between measured depths and the map's from which the visit is in another unit."""
 
 
 def update_settings(path: Path, file: Path | None, pairs: list[str]) -> MapConfig:
     """The settings that the map at `path` was made with, but for those of its own input, overridden by the TOML file
-    and KEY=VALUE pairs. InputError for the first error, and where masks have to be given."""
+    and KEY=VALUE pairs. InputError for the first error, for a pair without effect, and where masks have to be given."""
+    if unused := next((key for key in read_pairs(pairs) if key.startswith(OF_MAP)), None):
+        what = "has no effect on an update, which keeps the frame and the unit of its map"
+        raise InputError(f"{unused}: {what}; leave it out (perception scale changes the unit of a map)")
     known = dict(fields(MapConfig))
     before = dict(flat(read_info(path).get("config", {})))
     own = {key: value for key, value in before.items() if key in known and not key.startswith(OF_INPUT)}
@@ -71,7 +78,7 @@ def visit_scene(run: Run, gmap: Map, output: Path) -> Scene:
         if source.suffix.lower() in VIDEO_SUFFIXES and source.is_file():
             photos_of = frames_folder(output)
             video_frames(source, photos_of, run.progress)
-        return _localised(run, gmap, photos_of, camera)
+        return with_checked_masks(_localised(run, gmap, photos_of, camera, masks), masks)
     scene = load_scene(source, options)
     if not scene.views:
         raise InputError(f"{source}: holds no posed photo; give photos of a new visit")
@@ -81,8 +88,10 @@ def visit_scene(run: Run, gmap: Map, output: Path) -> Scene:
     return replace(scene, views=[moved(view, b_from_a) for view in scene.views])
 
 
-def _localised(run: Run, gmap: Map, source: Path, camera: Path | None) -> Scene:
+def _localised(run: Run, gmap: Map, source: Path, camera: Path | None, masks: Path | None) -> Scene:
     found = new_photos([source], camera, run.work / "sfm", run.progress)
+    for photo in found if run.config.photos.strict else ():
+        why_left_out(photo.photo, strict=True)
     localiser = Localiser(gmap, progress=run.progress)
     if localiser.rendered:
         run.progress.log(rendered_notice(gmap, localiser.rendered))
@@ -93,10 +102,9 @@ def _localised(run: Run, gmap: Map, source: Path, camera: Path | None) -> Scene:
         first = f"first: {lost.name}: {lost.why}"
         many = f"{len(answers) - len(here)} of {len(answers)} photos are not in {gmap.path} ({first})"
         raise InputError(f"{run.source}: {many}; give photos of the mapped scene, or map this one anew")
+    views = [make_view(a.name, a.photo, a.lens, a.camera_from_map, a.photo) for a in here]
     depths = {photo.name: photo.depth for photo in found}
-    views = [
-        replace(make_view(a.name, a.photo, a.lens, a.camera_from_map, a.photo), depth=depths[a.name]) for a in here
-    ]
+    views = [replace(view, depth=depths[view.name], mask=mask_of(masks, view.name)) for view in views]
     left = [{"name": a.name, "why": a.why} for a in answers if not isinstance(a, Localised)]
     report = {"input": "photos", "left_out": left}
     none = np.zeros((0, 3))

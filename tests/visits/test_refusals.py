@@ -18,7 +18,7 @@ from perception.map.write import read_map, set_labels, write_map
 from perception.pipeline.changes import inputs_of
 from perception.pipeline.checkpoint import digest, fingerprint
 from perception.visits.look import Look
-from perception.visits.scene import foreign_photos, refuse_older
+from perception.visits.scene import foreign_photos, refuse_older, update_settings
 from perception.visits.update import update_map
 from support.visited_map import number, write_visited_map
 
@@ -64,6 +64,14 @@ def test_depth_in_another_unit_is_refused(tmp_path: Path) -> None:
     assert foreign_photos(tmp_path, a_map([]), [look(1.0)]) == []
     with pytest.raises(InputError, match="another unit: its depth images measure 1e"):
         foreign_photos(tmp_path, a_map([]), [look(1000.0)])
+
+
+def test_a_setting_without_effect_is_refused(tmp_path: Path) -> None:
+    path = write_visited_map(tmp_path / "a.gsmap")
+    for pair in ("frame.known_length=2: mug, lamp", "splat.unit=metre", "photos.init_points=a.ply"):
+        with pytest.raises(InputError, match="no effect on an update"):
+            update_settings(path, None, ["seed=1", pair])
+    assert update_settings(path, None, ["seed=1"]).seed == 1
 
 
 def test_a_finished_update_is_that_of_the_same_photos_and_the_same_map(tmp_path: Path) -> None:
