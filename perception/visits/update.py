@@ -25,6 +25,7 @@ from perception.gaussians.model import Nearby
 from perception.instances.group import Grouping
 from perception.language.base import Encoder
 from perception.language.ocr import make_reader
+from perception.machine import peak_memory_mib
 from perception.map.history import is_removed
 from perception.map.write import Map, read_map, write_map
 from perception.masks import make_source
@@ -133,7 +134,7 @@ def _described(visit: Visit, today: Today, encoder: Encoder | None) -> Described
 
 def assembled(visit: Visit, today: Today, described: DescribedInstances, output: Path, mark: str) -> Map:
     """The map of today."""
-    gmap, run, number = visit.gmap, visit.run, visit.number
+    gmap, run, number, prefix = visit.gmap, visit.run, visit.number, _prefix(visit)
     gaussians = today.gaussians
     instances = []
     for entry, signs in zip(gmap.instances, today.signs, strict=True):
@@ -149,7 +150,7 @@ def assembled(visit: Visit, today: Today, described: DescribedInstances, output:
         instances.append({**entry, "id": i, **state, **seen})
     with run.stage("score"):
         quality = score_views(gaussians, visit.photos.held, gmap.metric)
-        quality["views"] = {_name(name, number): figures for name, figures in quality["views"].items()}
+        quality["views"] = {prefix + name: figures for name, figures in quality["views"].items()}
     arrays = {name: getattr(gaussians, name).numpy() for name in TENSORS}
     fresh = slice(len(today.kept), None)
     norm = np.linalg.norm(arrays["quats"][fresh], axis=1, keepdims=True)
@@ -159,12 +160,14 @@ def assembled(visit: Visit, today: Today, described: DescribedInstances, output:
         groups["of"] = np.append(groups["of"], np.full(len(today.added), -1)).astype(np.int32)
     assert gmap.path is not None
     old = [view for view in gmap.views if isinstance(view, StoredView)]
-    views = [*(moved_record(view, gmap.path, output) for view in old), *_views(visit, output)]
+    views = [*(moved_record(view, gmap.path, output) for view in old), *_views(visit, output, prefix)]
     info = {**gmap.info, "visits": visits_with(gmap, run.source, [v.photo for v in views if v.visit == number])}
     seconds = {**run.seconds, "total": time.monotonic() - run.started}
     info |= {"quality": quality, "config": run.config.to_json(), "fingerprint": mark, "seconds": seconds}
     info["instances"] = {**info.get("instances", {}), "count": len(instances)}
-    info |= {"training": asdict(today.record), "masks": visit.masks}
+    info |= {"training": asdict(today.record), "masks": visit.masks, "peak_memory_mib": peak_memory_mib()}
+    scene, left_out = info.get("scene", {}), [{**entry, "name": prefix + entry["name"]} for entry in visit.left_out]
+    info["scene"] = {**scene, "left_out": [*scene.get("left_out", []), *left_out]}
     return Map(
         **arrays,
         instance_ids=today.ids,
@@ -172,15 +175,23 @@ def assembled(visit: Visit, today: Today, described: DescribedInstances, output:
         instances=finite(instances),
         info=finite(info),
         views=views,
-        language=joined_language(gmap.language, _renamed(described.language, number)),
+        language=joined_language(gmap.language, _renamed(described.language, prefix)),
         parts=kept_parts(gmap.parts, today.part_ids, instances),
         groups=groups,
         past=past_with(gmap, today.gone, number - 1),
     )
 
 
-def _views(visit: Visit, output: Path) -> list[Any]:
-    """The views of the visit as the map records them; the visit is part of their names, which are unique."""
+def _prefix(visit: Visit) -> str:
+    """Of the names of the visit's views in the map, so that none of its other views has such a name."""
+    prefix = f"visit{visit.number}"
+    while any(view.name.startswith(f"{prefix}/") for view in visit.gmap.views):
+        prefix += "-again"
+    return f"{prefix}/"
+
+
+def _views(visit: Visit, output: Path, prefix: str) -> list[Any]:
+    """The views of the visit as the map records them."""
     photos, made = visit.photos, []
     decoded = {view.name: view for view in (*photos.views, *photos.held)}
     held = {view.name for view in photos.held}
@@ -188,18 +199,14 @@ def _views(visit: Visit, output: Path) -> list[Any]:
         gain = decoded[view.name].gain
         view = replace(view, gain=None if gain is None else tuple(gain.double().tolist()))
         record = stored_view(view, output, view.name in held, visit.number)
-        made.append(replace(record, name=_name(view.name, visit.number)))
+        made.append(replace(record, name=prefix + view.name))
     return made
 
 
-def _name(photo: str, number: int) -> str:
-    return f"visit{number}/{photo}"
-
-
-def _renamed(language: dict[str, np.ndarray], number: int) -> dict[str, np.ndarray]:
+def _renamed(language: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
     if not language:
         return {}
-    names = np.array([_name(str(name), number) for name in language["view_names"]], dtype=np.str_)
+    names = np.array([prefix + str(name) for name in language["view_names"]], dtype=np.str_)
     return {**language, "view_names": names}
 
 

@@ -46,7 +46,8 @@ def gaussians_of(gmap: Map, rows: np.ndarray) -> Gaussians:
 class Visit:
     """The photos of a visit against the map. number: of the visit; rows [R]: of the map's Gaussians, those that a photo
     may show; gaussians: these, in the light of the visit, with instances ids [R]; light [3]: its colours over the
-    map's; photos: exposed and labelled; stereo: depths of the training photos; masks: report; mark: of its training."""
+    map's; photos: exposed and labelled; stereo: depths of the training photos; masks: report; mark: of its training;
+    left_out: names of photos that are not used, and why."""
 
     run: Run
     gmap: Map
@@ -58,6 +59,7 @@ class Visit:
     stereo: list[StereoView | None]
     masks: dict[str, Any]
     mark: str
+    left_out: list[dict[str, str]]
 
     @property
     def ids(self) -> np.ndarray:
@@ -95,8 +97,9 @@ def open_visit(run: Run, gmap: Map, source: MaskSource, output: Path) -> Visit:
     with run.stage("poses"):
         scene = visit_scene(run, gmap, output)
         refuse_older(gmap, scene.views)
-    for entry in scene.report.get("left_out", []):
-        run.progress.log(f"left out: {entry['name']} ({entry['why']})")
+    left_out = _told(run, scene.report.get("left_out", []))
+    for note in scene.report.get("notes", []):
+        run.progress.log(note)
     scene, training, held_out = split_scene(scene, run.config.photos)
     photos = Photos.load(run, training, held_out)
     rows = np.flatnonzero(in_view(gmap.means, gmap.scales.max(axis=1), [*photos.views, *photos.held]))
@@ -108,8 +111,8 @@ def open_visit(run: Run, gmap: Map, source: MaskSource, output: Path) -> Visit:
         foreign = foreign_photos(run.source, gmap, shown)
         shown = [each for each, view in zip(shown, photos.training, strict=True) if view.name not in foreign]
         photos = _without(photos, foreign)
-        for name in foreign:
-            run.progress.log(f"left out: {name} (does not show what the map holds there)")
+        why = "does not show what the map holds there"
+        left_out += _told(run, [{"name": name, "why": why} for name in foreign])
         run.progress.log(f"{len(photos.views)} photos of the visit; light {', '.join(f'{x:.2f}' for x in light)}")
         stereo = stereo_of(photos.training, photos.views, shown, run.progress)
     depths = {view.name: each for view, each in zip(photos.training, stereo, strict=True)}
@@ -118,7 +121,14 @@ def open_visit(run: Run, gmap: Map, source: MaskSource, output: Path) -> Visit:
     )
     number = len(gmap.info.get("visits") or [0])
     mark = digest(gmap.map_id, training_mark(run.source, run.config), source.identity)
-    return Visit(run, gmap, number, rows, lit, light, photos, stereo, masks, mark)
+    return Visit(run, gmap, number, rows, lit, light, photos, stereo, masks, mark, left_out)
+
+
+def _told(run: Run, left_out: Sequence[dict[str, str]]) -> list[dict[str, str]]:
+    """Logs the photos that are not used."""
+    for entry in left_out:
+        run.progress.log(f"left out: {entry['name']} ({entry['why']})")
+    return list(left_out)
 
 
 def _exposed(old: Gaussians, photos: Photos) -> tuple[Photos, np.ndarray]:

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -20,7 +21,7 @@ from perception.config import load_config
 from perception.errors import InputError
 from perception.io.cloud import read_cloud
 from perception.map.history import changes_of, visits_of
-from perception.map.write import Map, read_map
+from perception.map.write import Map, read_map, write_map
 from perception.pipeline.checkpoint import work_folder
 from perception.pipeline.mapping import build_map
 from perception.visits.scene import update_settings
@@ -165,13 +166,24 @@ def test_a_killed_update_goes_on_to_the_same_map(world: Path, new: Map) -> None:
     assert all(one[name] == other[name] for name in one if name != "map.json")
 
 
-def test_photos_alone_are_localised(world: Path) -> None:
-    photos = world / "photos"
+def test_photos_alone_are_localised(world: Path, new: Map) -> None:
+    """Beside a damaged photo and one that its mask ignores, in a map of photos that lie in a folder visit1."""
+    photos, masks, old = world / "photos", world / "ignore", read_map(world / "old.gsmap")
     shutil.copytree(world / "visit1" / "images", photos)
-    assert main(command(world, photos, "localised.gsmap")) == 0
-    old, gmap = read_map(world / "old.gsmap"), read_map(world / "localised.gsmap")
+    (photos / "broken.jpg").write_bytes(b"no picture")
+    masks.mkdir()
+    cv2.imwrite(str(masks / "003.png"), np.zeros((150, 200), np.uint8))
+    old.views = [replace(view, name=f"visit1/{view.name}") for view in old.views]
+    old.info["peak_memory_mib"] = 1.0
+    write_map(world / "named.gsmap", old)
+    words = command(world, photos, "localised.gsmap")
+    assert main(["update", str(world / "named.gsmap"), *words[2:], "--ignore-masks", str(masks)]) == 0
+    gmap = read_map(world / "localised.gsmap")
+    assert len({view.name for view in gmap.views}) == len(gmap.views) > len(old.views)
+    left_out = {Path(entry["name"]).name for entry in gmap.info["scene"]["left_out"]}
+    assert left_out == {"broken.jpg", "003.jpg"} and gmap.info["peak_memory_mib"] > 1
     poses = {Path(view.name).name: view.camera_from_world for view in gmap.views if view.visit == 1}
-    given = {Path(v.name).name: v.camera_from_world for v in read_map(world / "new.gsmap").views if v.visit == 1}
+    given = {Path(v.name).name: v.camera_from_world for v in new.views if v.visit == 1 and "003" not in v.name}
     assert poses.keys() == given.keys()
     size = np.ptp(old.means, axis=0).max()
     shifts = [np.linalg.norm(np.linalg.inv(poses[n])[:3, 3] - np.linalg.inv(given[n])[:3, 3]) for n in poses]
