@@ -23,6 +23,7 @@ from perception.geometry import check_similarity, move_points, scale_of
 from perception.io.atomic import write_file
 from perception.io.cloud import read_cloud, storable, write_cloud
 from perception.io.documents import refusing
+from perception.map.history import is_removed
 from perception.map.write import Map, read_map
 from perception.types import PointCloud
 
@@ -201,13 +202,14 @@ def at_granularity(gmap: Map, granularity: str) -> tuple[np.ndarray, dict[int, d
     if granularity == "parts" and "ids" in gmap.parts:
         parts = {part["id"]: part for entry in gmap.instances for part in entry.get("parts", [])}
         return np.where(np.isin(gmap.parts["ids"], list(parts)), gmap.parts["ids"], gmap.instance_ids), entries | parts
-    groups = gmap.group_ids
+    gone = [n for n, entry in zip(gmap.groups.get("of", ()), gmap.instances, strict=False) if is_removed(entry)]
+    groups = np.where(np.isin(gmap.group_ids, gone), -1, gmap.group_ids)  # one that lost a member is none
     if granularity != "groups" or not (groups >= 0).any():
         why = "only built-in masks that were unsure make them (parts also: photos that disagree)"
         raise InputError(f"{gmap.path}: holds no {granularity} of instances; {why}; leave out --granularity")
     ids = gmap.instance_ids.copy()
-    for group, score in enumerate(gmap.groups["scores"].tolist()):
-        members = np.unique(ids[groups == group]).tolist()
+    for group in np.unique(groups[groups >= 0]):
+        members, score = np.unique(ids[groups == group]).tolist(), float(gmap.groups["scores"][group])
         ids[groups == group] = members[0]
         entries[members[0]] = {"label": None, "score": score, "instances": members}
     return ids, entries

@@ -11,6 +11,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.ply import map_ply, write_ply
+from perception.map.history import is_removed
 from perception.map.map import Map
 from perception.map.outputs import refuse_inputs
 
@@ -33,7 +34,7 @@ def export_splat(
         raise InputError(f"{output}: expected a file OUT.ply for --splat; -o OUT.spz writes compressed Gaussians")
     gmap = Map.open(map_path)
     ids = gmap.instance_ids
-    known = [entry["id"] for entry in gmap.instances]
+    known = [entry["id"] for entry in gmap.instances if not is_removed(entry)]
     for number in (*only, *without):
         if number not in known:
             raise InputError(f"{map_path}: has no instance {number}; `perception query` and `info` list those it has")

@@ -224,3 +224,25 @@ def test_a_map_of_one_visit_has_the_path_of_its_input() -> None:
     """`scene.input` is the kind of it."""
     info = {"source": "/home/me/photos", "scene": {"input": "transforms"}}
     assert visits_of(info, 7) == [Visit(0, None, "/home/me/photos", 7)]
+
+
+def test_exports_hold_what_stands_there_today(path: Path, tmp_path: Path) -> None:
+    """The mug is gone: no file of its own, and no group, alone or with the banana."""
+    gmap, out = read_map(path), tmp_path / "out.ply"
+    assert main(["export", str(path), "--splat", str(out), "--each"]) == 0
+    stands = {number(name) for name, state in STATES.items() if state != "removed"}
+    assert {int(file.stem.removeprefix("out-")) for file in tmp_path.glob("out-*.ply")} == stands
+    assert main(["export", str(path), "--splat", str(out), "--only", str(number("mug"))]) == 2
+    of = {"mug": 0, "banana": 0, "lamp": 1, "kettle": 1}
+    gmap.groups = {"of": np.int32([of.get(name, -1) for name in NAMES]), "scores": np.float32([0.5, 0.6])}
+    write_map(tmp_path / "a.gsmap", gmap)
+    assert main(["export", str(tmp_path / "a.gsmap"), "-o", str(out), "--granularity", "groups"]) == 0
+    groups = [
+        e["instances"]
+        for e in json.loads(out.with_suffix(".json").read_text())["instances"].values()
+        if "instances" in e
+    ]
+    assert groups == [[number("lamp"), number("kettle")]]
+    gmap.groups = {"of": np.int32([0 if name == "mug" else -1 for name in NAMES]), "scores": np.float32([0.5])}
+    write_map(tmp_path / "a.gsmap", gmap)
+    assert main(["export", str(tmp_path / "a.gsmap"), "-o", str(out), "--granularity", "groups"]) == 2
