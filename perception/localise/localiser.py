@@ -310,8 +310,8 @@ def _finder(gmap: Map, folder: Path | None) -> Locate:
         try:
             return replace(view, photo=locate_photo(view, gmap.path))
         except InputError:
-            found = (folder / name for name in (view.name, Path(view.name).name)) if folder is not None else ()
-            for file in found:
+            names = (view.name, getattr(view, "photo_name", view.name), Path(view.name).name)
+            for file in [] if folder is None else [folder / name for name in names]:
                 with suppress(InputError):
                     return replace(view, photo=locate_photo(replace(view, photo=file), None))
             raise

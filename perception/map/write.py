@@ -136,8 +136,8 @@ def tidy_label(label: str) -> str:
 def relink(path: Path, folder: Path) -> dict[str, Any]:
     """Records for every view of the map at `path` the photo below `folder` with the same name and size.
 
-    A photo is searched by the view name ("a/0001.jpg"), else by the file name alone if that is unique below `folder`;
-    capitals and small letters are the same.
+    A photo is searched by the view name ("a/0001.jpg"), that among the photos of its visit, else by the file name alone
+    if that is unique below `folder`; capitals and small letters are the same.
     Views without such a photo keep their record. Returns {"linked": count, "missing": names, "differ": names of
     photos of another size}. InputError when no photo is found, or while the map is locked by another writer.
     """
@@ -152,7 +152,8 @@ def relink(path: Path, folder: Path) -> dict[str, Any]:
         entries, linked, missing, differ = [], 0, [], []
         for entry, view in zip(files.facts.get("views", []), files.read("views"), strict=True):
             alike = by_name[folded(PurePosixPath(view.name).name)]
-            found = named.find(view.name) or (alike[0] if len(alike) == 1 and alike[0].is_file() else None)
+            found = next(filter(None, map(named.find, (view.name, view.photo_name))), None)
+            found = found or (alike[0] if len(alike) == 1 and alike[0].is_file() else None)
             if found is None:
                 missing.append(view.name)
             elif view.photo_bytes not in (None, found.stat().st_size):

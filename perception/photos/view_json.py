@@ -66,6 +66,11 @@ class StoredView(View):
     photo_bytes: int | None = None
     visit: int = 0
 
+    @property
+    def photo_name(self) -> str:
+        """The name among the photos of its visit, before which `perception update` puts the visit."""
+        return self.name.partition("/")[2] if self.visit else self.name
+
 
 def stored_view(view: View, folder: Path, held_out: bool = False, visit: int = 0) -> StoredView:
     """`view` with the record of its photo for the map at `folder`: both paths, and the size (None if missing)."""

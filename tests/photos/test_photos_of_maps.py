@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,7 @@ from perception.cli import main
 from perception.errors import InputError
 from perception.map.map import PhotosMoved
 from perception.map.write import read_map, relink, verify_map, write_map
+from perception.photos.view_json import stored_view
 from perception.query.crops import best_crop
 from perception.types import View
 from support.query_maps import write_map_of
@@ -100,6 +102,21 @@ def test_relink_finds_photos_by_name_and_size(path: Path, capsys: pytest.Capture
     assert relink(path, path.parents[1] / "disk")["linked"] == 1 and shown(path) == RED
     (deeper / "00000.png").rename(deeper / "00000.PNG")  # by way of a disk that does not tell them apart
     assert relink(path, path.parents[1] / "disk")["linked"] == 1 and shown(path) == RED
+
+
+def test_relink_finds_the_photos_of_a_later_visit_in_its_folders(path: Path) -> None:
+    """Two cameras name their photos alike; the map names those of the visit "visit1/left/1.png"."""
+    gmap, visit = read_map(path), path.parents[1] / "visit"
+    for side, width in (("left", 32), ("right", 40)):
+        photo_of(visit / side / "1.png", BLUE, width)
+        view = View(f"{side}/1.png", visit / side / "1.png", np.eye(3), width, 48, np.eye(4))
+        gmap.views.append(replace(stored_view(view, path, visit=1), name=f"visit1/{view.name}"))
+    gmap.info["visits"] = [{"time": None, "input": name, "photos": n} for n, name in enumerate(("a", "b"), 1)]
+    write_map(path, gmap)
+    visit.rename(moved := visit.with_name("moved"))
+    assert relink(path, moved) == {"linked": 2, "missing": ["s/00000.png"], "differ": []}
+    found = [view.photo for view in read_map(path).located_views()[1:]]
+    assert found == [moved / "left" / "1.png", moved / "right" / "1.png"]
 
 
 def test_relink_refuses_a_folder_without_the_photos(path: Path) -> None:
