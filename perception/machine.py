@@ -6,6 +6,7 @@ import ctypes
 import math
 import os
 import resource
+import shutil
 import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -21,9 +22,19 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 MOST_THREADS = 8
 """Photos that are worked on at a time; each takes tens of megabytes, and Python's own steps take turns anyway."""
+LEAST_DISK = 256 << 20
+"""Least free disk space in bytes, as a small run needs it for features, masks, checkpoint and map."""
 _CGROUPS, _OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 threads_before: ContextVar[int] = ContextVar("threads_before", default=0)
 """Threads that torch had outside `torch_on_one_thread`; 0 outside of it."""
+
+
+def refuse_full_disk(folder: Path) -> None:
+    """InputError where the disk that holds a folder has less than LEAST_DISK free: libraries that write features there
+    abort the process when it becomes full."""
+    if (free := shutil.disk_usage(folder).free) < LEAST_DISK:
+        found = f"its disk has {free >> 20} MiB free, at least {LEAST_DISK >> 20} are needed"
+        raise InputError(f"{folder}: {found}; free some")
 
 
 def cores() -> int:

@@ -12,6 +12,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.localise.keypoints import Described, described, tolerance, triangulated
+from perception.machine import refuse_full_disk
 from perception.map.map import MAX_SIDE, Map
 from perception.photos.decode import scaled_K, scaled_size, why_left_out
 from perception.photos.views import view_lens
@@ -47,6 +48,7 @@ def open_reference(gmap: Map, locate: Locate, progress: Progress) -> Reference:
     if not gmap.views:
         raise InputError(f"{gmap.path}: holds no views, so photos cannot be localised in it; map it from photos")
     with TemporaryDirectory(prefix="perception-localise-") as folder:
+        refuse_full_disk(Path(folder).parent)
         views, rendered = _pictures(gmap, locate, Path(folder), progress)
         lenses, masks = [view_lens(view) for view in views], [view.mask for view in views]
         options = ReadOptions(Path(folder), progress=progress)

@@ -34,7 +34,7 @@ from perception.gaussians.train import Trainer
 from perception.inputs.readers import EXPECTED
 from perception.io.atomic import atomic_file
 from perception.io.documents import refusing
-from perception.machine import peak_memory_mib
+from perception.machine import peak_memory_mib, refuse_full_disk
 from perception.map.replace import writing
 from perception.photos.video import FRAMES_RECORD
 from perception.progress import Progress
@@ -213,8 +213,6 @@ INPUTS = "inputs.json"
 TASKS = ("block-*", "labels-*", "model-*", "levels-*", "votes-*", "silhouettes-*", "leg-*")
 OWN = ("*.pt", "masks", "sfm", "poses-*", *TASKS, ".*.new-*", ".*.old-*", ".*.lock", INPUTS)
 """Names of all that a run writes in its work folder."""
-LEAST_DISK = 256 << 20
-"""Least free disk space in bytes, as a small run needs it for features, masks, checkpoint and map."""
 
 
 def check_name(output: Path) -> None:
@@ -251,7 +249,7 @@ def working(source: Path, output: Path, resume: bool) -> Iterator[Path]:
             yield work
             _remove(work)
         except OSError as error:
-            if error.errno != errno.ENOSPC:
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
             raise InputError(f"{work}: the disk is full; free some space and go on with --resume") from error
         except InputError:
@@ -291,11 +289,10 @@ def _prepare(source: Path, output: Path, resume: bool) -> Path:
         work.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{work}: cannot be made ({error.strerror}); choose a writable -o") from error
-    # Checked first, because libraries abort the process when the disk becomes full.
-    free = shutil.disk_usage(work).free
-    if free < LEAST_DISK:
+    try:
+        refuse_full_disk(work)
+    except InputError:
         if not any(work.iterdir()):
             work.rmdir()
-        found = f"the disk has {free >> 20} MiB free, at least {LEAST_DISK >> 20} are needed"
-        raise InputError(f"{output}: {found}; free some")
+        raise
     return work

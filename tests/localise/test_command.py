@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -120,6 +121,15 @@ def test_what_cannot_be_used_is_told_in_one_line(
     assert MapFiles(folder / "a.gsmap").map_id == before and json.loads(poses.read_text()) == {"frames": [frame]}
     assert main(["localise", str(folder / "a.gsmap"), str(folder / "other"), "--json"]) == 2
     assert json.loads(capsys.readouterr().out)["photos"][0]["localised"] is False
+
+
+def test_a_full_disk_is_told_before_a_library_aborts(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = shutil.disk_usage(folder)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=1 << 20))
+    assert main(["localise", str(folder / "a.gsmap"), str(folder / "new")]) == 2
+    assert f"error: {tempfile.gettempdir()}: its disk has 1 MiB free" in capsys.readouterr().err
 
 
 def test_rendering_takes_such_a_file_as_in_the_maps_frame(folder: Path, tmp_path: Path) -> None:
