@@ -73,13 +73,16 @@ def visits_of(info: dict[str, Any], photos: int = 0) -> list[Visit]:
 
 
 def date_of(visits: Sequence[Visit], number: int) -> str:
-    """The date of a visit in UTC, with the time of day if another visit has the same date; "visit 2" without a time."""
+    """The date of a visit in UTC, with the time of day if another visit has the same date, and its number if that has
+    the same time; "visit 2" without a time."""
     days = [datetime.fromisoformat(v.time.removesuffix("Z")) if v.time else None for v in visits]
-    day = days[number]
-    if day is None:
+    if days[number] is None:
         return f"visit {number}"
-    alone = sum(other is not None and other.date() == day.date() for other in days) == 1
-    return f"{day:%Y-%m-%d}" if alone else f"{day:%Y-%m-%d %H:%M}"
+    for form in ("%Y-%m-%d", "%Y-%m-%d %H:%M"):
+        texts = [day.strftime(form) if day else "" for day in days]
+        if texts.count(texts[number]) == 1:
+            return texts[number]
+    return f"{texts[number]} (visit {number})"
 
 
 def visit_number(visits: Sequence[Visit], text: str | int) -> int:

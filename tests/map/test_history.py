@@ -163,6 +163,8 @@ def test_dates_of_one_day_have_a_time() -> None:
         "2026-11-25 21:00",
         "visit 4",
     ]
+    twice = [Visit(n, TIMES[2], "", 1) for n in range(2)]  # the same photos again
+    assert [date_of(twice, n) for n in (0, 1)] == ["2026-11-25 19:41 (visit 0)", "2026-11-25 19:41 (visit 1)"]
 
 
 def test_edits_keep_the_record_consistent(path: Path, tmp_path: Path) -> None:
