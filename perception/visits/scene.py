@@ -112,9 +112,8 @@ def _localised(run: Run, gmap: Map, source: Path, camera: Path | None, masks: Pa
 
 
 def refuse_older(gmap: Map, views: Sequence[View]) -> None:
-    """InputError where the photos were taken before those of the map's newest visit, by EXIF."""
-    newest = max((getattr(view, "visit", 0) for view in gmap.views), default=0)
-    before = [view.photo for view in gmap.located_views() if getattr(view, "visit", 0) == newest]
+    """InputError where the photos were taken before the newest of the map's, by EXIF, which a visit may lack."""
+    before = [view.photo for view in gmap.located_views()]
     map_time, time = time_taken([photo for photo in before if photo != Path()]), time_taken([v.photo for v in views])
     if map_time is not None and time is not None and time < map_time:
         when = f"its photos were taken until {time}, those of {gmap.path} until {map_time}"

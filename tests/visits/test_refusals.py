@@ -49,6 +49,9 @@ def test_photos_older_than_the_map_are_refused_by_their_exif(tmp_path: Path) -> 
     refuse_older(a_map(old), later)
     refuse_older(a_map(old), unknown)
     refuse_older(a_map(unknown), before)
+    unknown[0].visit = 1
+    with pytest.raises(InputError, match="older than the map"):
+        refuse_older(a_map([*old, *unknown]), before)
 
 
 def test_depth_in_another_unit_is_refused(tmp_path: Path) -> None:
