@@ -70,12 +70,15 @@ def scaled(gmap: Map, factor: float) -> Map:
             new["transform"] = (b_from_a @ np.array(motion) @ np.linalg.inv(b_from_a)).tolist()
         return new
 
+    past = {**gmap.past, "means": move_points(b_from_a, gmap.past["means"])} if gmap.past else {}
+    if "log_scales" in past:
+        past["log_scales"] = (past["log_scales"] + np.log(factor)).astype(past["log_scales"].dtype)
     return Map.of(
         gmap,
         means=move_points(b_from_a, gmap.means),
         log_scales=(gmap.log_scales + np.log(factor)).astype(np.float32),
         instances=[entry(old) for old in gmap.instances],
-        past={**gmap.past, "means": move_points(b_from_a, gmap.past["means"])} if gmap.past else {},
+        past=past,
         views=[moved(view, b_from_a) for view in gmap.views],
         info=info,
     )

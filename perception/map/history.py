@@ -17,7 +17,9 @@ past             where it stood before, oldest first: {"until", "centroid", "obb
 
 A removed instance stays in instances.json and language.npz, with `num_gaussians` 0 and its last box; the last entry of
 its `past` is the spot that it left. past.npz holds the means of what stood elsewhere: means [M, 3] float32, ids [M]
-int32, until [M] int32 as in `past`.
+int32, until [M] int32 as in `past`; and what it looked like, by which it is known when it comes back: quats [M, 4],
+log_scales [M, 3], opacity_logits [M], colors [M, 3] RGB in the light of the newest visit, float16. Zero quats: not
+known.
 """
 
 from __future__ import annotations

@@ -129,6 +129,10 @@ _LANGUAGE = {
     "view_embeddings": ("f", ("V", "D")),
 }  # fmt: skip
 """Kind and shape of the arrays of language.npz; a letter stands for the same number everywhere."""
+_LOOKS = {
+    "quats": ("f", ("M", 4)), "log_scales": ("f", ("M", 3)), "opacity_logits": ("f", ("M",)), "colors": ("f", ("M", 3)),
+}  # fmt: skip
+"""Those of past.npz that say what things looked like; all or none."""
 
 
 def _check_arrays(arrays: Arrays, expected: dict[str, tuple[str, tuple[Any, ...]]], **sizes: int) -> None:
@@ -159,7 +163,9 @@ def check_archive(name: str, arrays: Arrays, instances: list[dict[str, Any]], ga
     if not arrays:
         return None
     if name == "past":
-        _check_arrays(arrays, {"means": ("f", ("M", 3)), "ids": ("i", ("M",)), "until": ("i", ("M",))})
+        expected = {"means": ("f", ("M", 3)), "ids": ("i", ("M",)), "until": ("i", ("M",))}
+        looks = _LOOKS if any(name in arrays for name in _LOOKS) else {}
+        _check_arrays(arrays, {**expected, **looks})
         spots = {(entry["id"], spot["until"]) for entry in instances for spot in entry.get("past", ())}
         for pair in zip(*(np.unique(np.stack([arrays["ids"], arrays["until"]]), axis=1).tolist()), strict=True):
             if pair not in spots:

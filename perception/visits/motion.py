@@ -38,7 +38,8 @@ MARGIN = 0.3
 HOPELESS = -4.0
 """Log-odds of a first guess below which a motion is not refined."""
 ALIKE = 2
-"""Old things, most alike in colour, with which a new one is compared."""
+"""Old things, most alike in colour, with which a new one is compared, of those that this visit misses and of those that
+an earlier one did."""
 CERTAIN = 6.0
 """Log-odds of a motion from which no other thing is tried, unless that is as much alike."""
 TWINS = 0.15

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from perception.boxes import instance_entry
+from perception.colors import rgb_from_sh, sh_from_rgb
 from perception.gaussians.model import Gaussians
 from perception.language.description import from_arrays, to_arrays
 from perception.map.history import is_removed, visits_of
@@ -71,7 +73,7 @@ def recorded(entry: dict[str, Any], visit: int, signs: Signs, motion: Motion | N
     known = {"first_seen": 0, "last_seen": visit - 1, "last_looked_for": visit - 1}
     entry = {**{key: entry.get(key, value) for key, value in known.items()}, **entry}
     if is_removed(entry):
-        return entry
+        return entry if motion is None else returned(entry, visit, motion)
     if not signs.seen:
         return {**entry, "state": "unseen", "confidence": round(1 - 0.5 * min(1.0, signs.share / UNSEEN), 3)}
     if not gone:
@@ -80,11 +82,7 @@ def recorded(entry: dict[str, Any], visit: int, signs: Signs, motion: Motion | N
             "last_looked_for": visit,
         }  # fmt: skip
     stood = {"until": visit - 1, **{key: entry[key] for key in _GEOMETRY[1:] if key in entry}}
-    stood["transform"] = None if motion is None else motion.new_from_old.tolist()
-    if motion is not None and motion.ambiguous:
-        stood["ambiguous"] = True
-    if motion is not None and motion.axis is not None:
-        stood["axis"] = motion.axis.tolist()
+    stood |= {"transform": None} if motion is None else _motion_record(motion)
     past, sure = [*entry.get("past", ()), stood], 1 - probability(signs.log_odds)
     if motion is None:
         entry = {key: value for key, value in entry.items() if key != "parts"}
@@ -92,6 +90,25 @@ def recorded(entry: dict[str, Any], visit: int, signs: Signs, motion: Motion | N
     else:
         entry |= {"state": "moved", "confidence": round(sure * probability(motion.odds), 3), "last_seen": visit}
     return {**entry, "last_looked_for": visit, "past": past}
+
+
+def returned(entry: dict[str, Any], visit: int, motion: Motion) -> dict[str, Any]:
+    """The entry of a removed instance that a visit found again, still with its old geometry."""
+    *before, left = entry["past"]
+    away = {"until": visit - 1, **{key: entry[key] for key in _GEOMETRY[1:] if key in entry}, "gone": True}
+    past = [*before, {**left, "transform": np.eye(4).tolist()}, {**away, **_motion_record(motion)}]
+    state = {"state": "added", "confidence": round(probability(motion.odds), 3)}
+    return {**entry, **state, "last_seen": visit, "last_looked_for": visit, "past": past}
+
+
+def _motion_record(motion: Motion) -> dict[str, Any]:
+    """Keys of an entry of `past`."""
+    record: dict[str, Any] = {"transform": motion.new_from_old.tolist()}
+    if motion.ambiguous:
+        record["ambiguous"] = True
+    if motion.axis is not None:
+        record["axis"] = motion.axis.tolist()
+    return record
 
 
 def joined_language(old: dict[str, np.ndarray], new: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -120,14 +137,35 @@ def kept_parts(
     return arrays
 
 
-def past_with(gmap: Map, gone: Sequence[int], until: int) -> dict[str, np.ndarray]:
-    """past.npz with the means of the instances that no longer stand where they stood."""
+def past_with(gmap: Map, gone: Sequence[int], until: int, light: np.ndarray) -> dict[str, np.ndarray]:
+    """past.npz with the Gaussians of the instances that no longer stand where they stood, all in the light of the
+    visit: light [3] are its colours over the map's."""
     rows = np.flatnonzero(np.isin(gmap.instance_ids, list(gone)))
     made = {
         "means": gmap.means[rows].astype(np.float32),
         "ids": gmap.instance_ids[rows].astype(np.int32),
         "until": np.full(len(rows), until, np.int32),
+        "colors": rgb_from_sh(gmap.sh[rows, 0]).astype(np.float16),
+        **{name: getattr(gmap, name)[rows].astype(np.float16) for name in ("quats", "log_scales", "opacity_logits")},
     }
     if gmap.past:
-        made = {name: np.concatenate([gmap.past[name], array]) for name, array in made.items()}
+        blank = {name: np.zeros((len(gmap.past["ids"]), *array.shape[1:]), array.dtype) for name, array in made.items()}
+        made = {name: np.concatenate([gmap.past.get(name, blank[name]), array]) for name, array in made.items()}
+    made["colors"] = (made["colors"] * light).astype(np.float16)
     return made if len(made["ids"]) else {}
+
+
+def as_it_was(gmap: Map, entry: dict[str, Any]) -> Gaussians | None:
+    """The Gaussians of a removed instance where it stood last, without features; None where past.npz does not hold what
+    they looked like."""
+    past, last = gmap.past, entry["past"][-1]["until"]
+    rows = (
+        np.flatnonzero((past["ids"] == entry["id"]) & (past["until"] == last)) if "quats" in past else np.zeros(0, int)
+    )
+    if len(rows) == 0 or not past["quats"][rows].any():
+        return None
+    sh = np.zeros((len(rows), *gmap.sh.shape[1:]), np.float32)
+    sh[:, 0] = sh_from_rgb(past["colors"][rows].astype(np.float32))
+    looks = (past[name][rows].astype(np.float32) for name in ("means", "quats", "log_scales", "opacity_logits"))
+    features = np.zeros((len(rows), gmap.features.shape[1]), np.float32)
+    return Gaussians(*(torch.from_numpy(array) for array in (*looks, sh, features)))

@@ -180,27 +180,31 @@ def _shown_before(
 def _moved(
     visit: Visit, grown: Gaussians, things: list[tuple[np.ndarray, float]], gone: list[int]
 ) -> dict[int, tuple[int, Motion]]:
-    """By id of an instance that is gone: the number of the new thing that it is, and its motion."""
-    if not gone or not things:
+    """By id of an instance that is gone, or was already at an earlier visit: the number of the new thing that it is,
+    and its motion."""
+    lost = [*gone, *visit.away]
+    if not lost or not things:
         return {}
-    olds = {i: visit.thing(i) for i in gone}
+    olds = {i: visit.thing(i) for i in lost}
     depth = {entry["id"]: min(entry["obb"]["extent"]) for entry in visit.gmap.instances}
     gravity = visit.gmap.info.get("gravity")
     up = np.array(UP) if gravity is None else -np.array(gravity["direction"], np.float64)
-    frames, seen = visit.frames, {i: visit.seen_from(i) for i in gone}
-    odds, motions = np.full((len(gone), len(things)), -np.inf), dict[tuple[int, int], Motion]()
+    frames, seen = visit.frames, {i: visit.seen_from(i) for i in lost}
+    odds, motions = np.full((len(lost), len(things)), -np.inf), dict[tuple[int, int], Motion]()
     for j, (own, _) in enumerate(things):
         new = grown.rows(torch.from_numpy(own))
         rest = grown.rows(torch.from_numpy(np.setdiff1d(np.arange(len(grown)), own)))
-        alike = [looks_alike(olds[i], new) for i in gone]
-        likely = np.argsort(alike, kind="stable")[::-1][:ALIKE].tolist()
+        alike = [looks_alike(olds[i], new) for i in lost]
+        falling = np.argsort(alike, kind="stable")[::-1].tolist()
+        kinds = ([a for a in falling if (lost[a] in visit.away) is away] for away in (False, True))
+        likely = sorted((a for kind in kinds for a in kind[:ALIKE]), key=falling.index)
         for a in likely:
             if odds[:, j].max() > CERTAIN and alike[a] < alike[likely[0]] - TWINS:
                 break
-            found, cuts = motions_of(olds[gone[a]], new, frames, rest, up, depth[gone[a]])
+            found, cuts = motions_of(olds[lost[a]], new, frames, rest, up, depth[lost[a]])
             if not found or found[0][0].same + LOOKS[0] * (alike[a] - LOOKS[1]) < HOPELESS:
                 continue
-            motion = settled(olds[gone[a]], found, cuts, up, depth[gone[a]], alike[a], seen[gone[a]])
+            motion = settled(olds[lost[a]], found, cuts, up, depth[lost[a]], alike[a], seen[lost[a]])
             if motion is not None:
                 odds[a, j], motions[a, j] = motion.odds, motion
         visit.run.progress.update("motions", j + 1, len(things))
@@ -208,7 +212,7 @@ def _moved(
     for a, j in assigned(odds):
         rivals = np.concatenate([np.delete(odds[:, j], a), np.delete(odds[a], j)])
         unsure = rivals.max(initial=-np.inf) > odds[a, j] - CLOSE
-        pairs[gone[a]] = (j, replace(motions[a, j], ambiguous=motions[a, j].ambiguous or bool(unsure)))
+        pairs[lost[a]] = (j, replace(motions[a, j], ambiguous=motions[a, j].ambiguous or bool(unsure)))
     return pairs
 
 
@@ -292,9 +296,10 @@ def _settled(
     for i, (_, motion) in pairs.items():
         own = visit.rows_of(i)
         placed.append(carried(visit.thing(i), motion.new_from_old))
-        names.append(np.full(len(own), i, np.int32))
-        members.append(gmap.membership[own])
-        owned.append(parts[own])
+        names.append(np.full(len(placed[-1]), i, np.int32))
+        back = i in visit.away  # without rows in the map
+        members.append(np.ones(len(names[-1]), np.float32) if back else gmap.membership[own])
+        owned.append(np.full(len(names[-1]), -1, np.int32) if back else parts[own])
     together = Gaussians.concatenate(placed)
     config = update_config(run.config, len(visit.photos.views), SETTLING, len(together))
     start = together.sh.clone()

@@ -178,7 +178,7 @@ def assembled(visit: Visit, today: Today, described: DescribedInstances, output:
         language=joined_language(gmap.language, _renamed(described.language, prefix)),
         parts=kept_parts(gmap.parts, today.part_ids, instances),
         groups=groups,
-        past=past_with(gmap, today.gone, number - 1),
+        past=past_with(gmap, today.gone, number - 1, visit.light),
     )
 
 

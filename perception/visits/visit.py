@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import torch
 from perception.gaussians.model import Gaussians
 from perception.gaussians.photos import split_scene
 from perception.gaussians.views import TrainingView
-from perception.map.history import since
+from perception.map.history import is_removed, stood
 from perception.map.map import Map
 from perception.masks import MaskSource
 from perception.masks.stereo import StereoView
@@ -30,6 +31,7 @@ from perception.visits.look import (
     stereo_of,
     with_exposure,
 )
+from perception.visits.record import as_it_was
 from perception.visits.registration import compact
 from perception.visits.scene import foreign_photos, refuse_older, visit_scene
 
@@ -72,13 +74,23 @@ class Visit:
         return rows[compact(self.gmap.means[rows].astype(np.float64))]
 
     def thing(self, instance: int) -> Gaussians:
-        """These Gaussians, in the light of the visit."""
-        return in_light(gaussians_of(self.gmap, self.rows_of(instance)), self.light)
+        """These Gaussians, in the light of the visit; of a removed instance as it was."""
+        known = self.away.get(instance)
+        return in_light(gaussians_of(self.gmap, self.rows_of(instance)) if known is None else known, self.light)
+
+    @cached_property
+    def away(self) -> dict[int, Gaussians]:
+        """The removed instances of which the map knows what they looked like, by id."""
+        removed = {entry["id"]: as_it_was(self.gmap, entry) for entry in self.gmap.instances if is_removed(entry)}
+        found = ((i, thing, compact(thing.means.double().numpy())) for i, thing in removed.items() if thing is not None)
+        return {i: thing.rows(torch.from_numpy(np.flatnonzero(kept))) for i, thing, kept in found}
 
     def seen_from(self, instance: int) -> np.ndarray:
-        """[V, 3] directions to an instance where it stands from the map's views since it stands there, see `look`."""
+        """[V, 3] directions to an instance where it stands, or stood last, from the map's views of that time, see
+        `look`."""
         entry = next(entry for entry in self.gmap.instances if entry["id"] == instance)
-        views = [view for view in self.gmap.views if getattr(view, "visit", 0) >= since(entry)]
+        spot = entry["past"][-1] if is_removed(entry) else entry
+        views = [view for view in self.gmap.views if stood(entry, getattr(view, "visit", 0)) is spot]
         return seen_from(views, self.thing(instance).means.double().numpy())
 
     @property

@@ -118,6 +118,23 @@ def test_a_visit_without_changes_adds_nothing(world: Path) -> None:
     assert {entry["state"] for entry in gmap.instances} <= {"unchanged", "unseen"}
 
 
+def test_what_was_removed_and_comes_back_has_its_id_again(world: Path, new: Map) -> None:
+    """The third visit finds the place as the first one did."""
+    again = world / "visit2"
+    shutil.copytree(world / "visit0", again, copy_function=shutil.copyfile)  # newer photos
+    config = update_settings(world / "new.gsmap", None, [f"masks=labels:{again / 'labels'}"])
+    back = update_map(world / "new.gsmap", again, world / "back.gsmap", config)
+    then = {entry["id"]: entry for entry in read_map(world / "old.gsmap").instances}
+    gone = [entry["id"] for entry in new.instances if entry["state"] == "removed"]
+    found = {entry["id"]: entry for entry in back.instances if entry["id"] in gone and entry["state"] == "added"}
+    assert found, gone
+    for i, entry in found.items():
+        assert np.linalg.norm(np.subtract(entry["centroid"], then[i]["centroid"])) < 0.03  # a quarter of a thing
+        assert thing_of(back, i, again) == thing_of(read_map(world / "old.gsmap"), i, world / "visit0")
+        change = next(c for c in changes_of(visits_of(back.info), back.instances, 0) if c["instance_id"] == i)
+        assert change["state"] == "moved" and change["transform"] is not None
+
+
 def test_another_scene_and_other_masks_are_refused(world: Path, small_scene: Path) -> None:
     old = world / "old.gsmap"
     before = content(old)
