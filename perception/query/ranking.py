@@ -22,7 +22,8 @@ Further rules:
     at most 2 PRESENT p for encoders with canonical phrases c (LERF's "object", "thing" …), where with the model's own
         scale κ   p_ti = 1 / (1 + exp κ (max_c cos(c, e_i) − cos(t, e_i)))
     at least (1 − LAPSE) Φ((cos(t, l_i) − m_i) / s_i − LABEL_MARGIN) for a label l_i of the user, where m_i and s_i are
-        mean and standard deviation of cos(p, l_i) over the probes p;   1 if the label equals the prompt
+        mean and standard deviation of cos(p, l_i) over the probes p, or over texts that encoders may not understand and
+        find all alike (unread.txt), whichever of the two asks for more;   1 if the label equals the prompt
 
 An instance answers if it scores PRESENT or more and its Φ⁻¹(score / (1 − LAPSE)) is at most BESIDE below the best:
 "chair" has four answers, "red chair" one. All of this is relative to one map. `Prepared` holds what a prompt needs of a
@@ -47,6 +48,7 @@ from perception.language.description import InstanceDescription
 from perception.language.household import household_thing, size_misfits
 from perception.language.printed import Printed, quoted_text
 from perception.language.shape_words import HINTS, KINDS, STUFF, shape_kind
+from perception.query.where import tidy
 
 PRESENT = 0.8  # default minimum score of an answer; the probes are harder than typical absent objects
 LAPSE = 0.02  # share of prompts that mislead however large z is: 4 of 275 whose best hit had z > 2 were absent
@@ -165,6 +167,15 @@ class TextEncoder:
         middle, high = np.quantile(best, [0.5, QUANTILE])
         return float(middle), max(float(high - middle) / NORMAL_QUANTILE, 1e-6)
 
+    def label_null(self, rows: np.ndarray) -> np.ndarray:
+        """m_i and s_i [L, 2] of labels with the embeddings [L, D]."""
+        if not len(rows):
+            return np.zeros((0, 2), np.float32)
+        fits = [rows @ texts.T for texts in (self.probes, self.embed(lines("unread.txt")))]
+        nulls = [np.stack([fit.mean(axis=1), np.maximum(fit.std(axis=1), 1e-6)], axis=1) for fit in fits]
+        known, unread = (null @ [1.0, LABEL_MARGIN] for null in nulls)
+        return np.where((known >= unread)[:, None], *nulls)
+
     def _spreads(self, texts: np.ndarray, columns: slice, part: Part) -> np.ndarray:
         """σ_tk [T] of text embeddings [T, D] in one part; 1 where the encoder has no reference words for it."""
         if part.references is None:
@@ -190,7 +201,7 @@ class Scorer:
     ) -> None:
         self.encoder, self.prepared, self.seen = encoder, prepared, prepared.seen
         self._measure_shapes, self._printed, self._reads = shapes, printed, reads
-        names = [_normal(label) for label in prepared.labels]
+        names = [tidy(label or "") for label in prepared.labels]
         self._named = np.flatnonzero([name != "" for name in names])
         self._names = [names[i] for i in self._named]
 
@@ -280,7 +291,7 @@ class Scorer:
         middle, spread = self.prepared.label_null.T
         fits = self.prepared.label_rows @ self.encoder.embed([text])[0]
         z = ((fits - middle) / spread).astype(np.float64)
-        same = np.array([name == _normal(text) for name in self._names])
+        same = np.array([name == tidy(text) for name in self._names])
         alike = (1 - LAPSE) * normal_cdf(z - LABEL_MARGIN)
         scores[self._named] = np.where(same, 1.0, np.maximum(scores[self._named], alike))
         return scores
@@ -314,8 +325,7 @@ class Ranker(Scorer):
         compared = texts.compared(rows, seen)
         palettes = np.array([d.palette for d in descriptions])
         colors = [color_share(palettes, word) if count else np.zeros(0) for word in COLOR_WORDS]
-        label_rows = texts.embed([name for label in labels if (name := _normal(label))])
-        fits = label_rows @ texts.probes.T
+        label_rows = texts.embed([name for label in labels if (name := tidy(label or ""))])
         prepared = Prepared(
             seen=seen,
             null=np.tile(texts.null(compared, seen), (count, 1)),
@@ -325,7 +335,7 @@ class Ranker(Scorer):
             compared=compared,
             labels=labels,
             label_rows=label_rows,
-            label_null=np.stack([fits.mean(axis=1), np.maximum(fits.std(axis=1), 1e-6)], axis=1),
+            label_null=texts.label_null(label_rows),
         )
         super().__init__(texts, prepared, shapes, printed)
 
@@ -335,10 +345,10 @@ class Ranker(Scorer):
 
 
 def probes() -> list[str]:
-    """Objects that are rarely in a scene, one per line in probes.txt."""
-    return (Path(__file__).parent / "probes.txt").read_text(encoding="utf-8").split("\n")[:-1]
+    """Objects that are rarely in a scene."""
+    return lines("probes.txt")
 
 
-def _normal(text: str | None) -> str:
-    """A label or prompt in lower case, with single spaces."""
-    return " ".join((text or "").lower().split())
+def lines(name: str) -> list[str]:
+    """Those of a file in this folder."""
+    return (Path(__file__).parent / name).read_text(encoding="utf-8").split("\n")[:-1]

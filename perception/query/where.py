@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 
@@ -110,8 +111,8 @@ def position_of(point_or_pose: Any) -> np.ndarray:
 
 
 def tidy(text: str) -> str:
-    """A label normalised for comparison: case-folded, runs of white space replaced by one space."""
-    return " ".join(text.casefold().split())
+    """A label normalised for comparison: case-folded, accents composed (NFC), runs of white space replaced by one."""
+    return " ".join(normalize("NFC", text.casefold()).split())
 
 
 def axis_box(low: Sequence[float] | np.ndarray, high: Sequence[float] | np.ndarray) -> OrientedBox:

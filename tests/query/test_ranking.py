@@ -24,6 +24,7 @@ from perception.language.colors import (
     palette,
     without_color_words,
 )
+from perception.language.conse import ConseEncoder
 from perception.language.description import (
     InstanceDescription,
     check_encoder,
@@ -144,6 +145,28 @@ def test_a_label_that_means_the_prompt_is_an_answer(scene: tuple[Table, list[Ins
     without = rank("mug", things, encoder)
     assert dict(answer.hits)[3] > 0.9 > dict(without.hits)[3]
     assert dict(answer.hits)[2] == pytest.approx(dict(without.hits)[2])
+
+
+@pytest.mark.parametrize("label", ["Werkzeugwagen", "книга", "桌子", "K17"])
+@pytest.mark.parametrize("prompt", ["Schraubendreher", "ноутбук", "电视", "T800", "and"])
+def test_a_label_that_the_encoder_cannot_read_answers_to_itself_alone(label: str, prompt: str) -> None:
+    encoder = ConseEncoder()
+    things = [unseen(encoder.dim)]
+    assert not rank(prompt, things, encoder, labels=[label]).present  # another thing, in words that no list here holds
+    assert rank(label, things, encoder, labels=[label]).hits == [(0, 1.0)]
+
+
+@pytest.mark.parametrize(("label", "prompt"), [("red mug", "cup"), ("armchair", "chair"), ("fridge", "refrigerator")])
+def test_a_label_in_words_that_the_encoder_knows_answers_to_others_for_it(label: str, prompt: str) -> None:
+    assert rank(prompt, [unseen(ConseEncoder.dim)], ConseEncoder(), labels=[label]).present
+
+
+def test_labels_are_compared_without_regard_to_capitals_and_to_how_accents_are_written(
+    scene: tuple[Table, list[InstanceDescription]],
+) -> None:
+    encoder, things = scene
+    for label, prompt in (("Cafe\u0301", "caf\u00c9"), ("Straße", "STRASSE")):
+        assert rank(prompt, things, encoder, labels=[None, label, None, None]).hits[0] == (1, 1.0)
 
 
 def test_an_empty_map_and_unseen_instances(scene: tuple[Table, list[InstanceDescription]]) -> None:
