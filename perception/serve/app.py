@@ -8,16 +8,17 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from fastapi import FastAPI, Path, Query, Request
+from fastapi import Depends, FastAPI, Path, Query, Request
 from fastapi.responses import JSONResponse, Response
 from starlette.concurrency import run_in_threadpool
 
 from perception import __version__
+from perception.errors import InputError
 from perception.io.ply import ply_bytes
 from perception.query import Frame, Hit, QueryMap
 from perception.serve.bodies import AtBody, FindBody, NearestBody, QueryBody
 from perception.serve.engine import QueryEngine
-from perception.serve.guard import HANDLERS, HttpGuard
+from perception.serve.guard import HANDLERS, OPEN, HttpGuard
 from perception.serve.localise import LocaliseBody
 from perception.serve.requests import ServeSettings, source
 
@@ -65,6 +66,7 @@ def build_app(engine: QueryEngine, settings: ServeSettings) -> FastAPI:
         redoc_url=None,
         redirect_slashes=False,
         exception_handlers=HANDLERS,
+        dependencies=[Depends(refuse_unknown)],
     )
     app.add_middleware(HttpGuard, settings=settings)
     add_state(app, engine)
@@ -72,6 +74,15 @@ def build_app(engine: QueryEngine, settings: ServeSettings) -> FastAPI:
     add_instances(app, MapQueries(engine))
     add_localising(app, MapQueries(engine), settings)
     return app
+
+
+async def refuse_unknown(request: Request) -> None:
+    """InputError for a parameter of the address that the page does not know, as for a field of a body: `at` belongs to
+    the address of a GET and to the body of a POST, and elsewhere the answer would be as of another visit."""
+    known = [parameter.alias for parameter in request.scope["route"].dependant.query_params]
+    other = next((name for name in request.query_params if name not in known), None)
+    if other is not None and request.scope["path"] not in OPEN:
+        raise InputError(f"{other[:80]}: no parameter of this address, which has {', '.join(known) or 'none'}")
 
 
 @dataclass(frozen=True)

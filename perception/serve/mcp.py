@@ -86,7 +86,6 @@ class Tool(Body):
             raise UnknownFrame(f"frame: found '{self.frame[:40]}', expected {known}")
         frame = self.frame.frame() if isinstance(self.frame, FrameBody) else None
         facts = source(gmap, frame)
-        facts["metric"] &= frame is None or abs(scale_of(frame.from_map) - 1) < 1e-6
         if self.unit == "m" and not facts["metric"]:
             raise NoScale(f"unit: lengths in frame '{facts['frame']}' are not known to be metres; ask without unit")
         unit = "m" if facts["metric"] else f"unit of frame {facts['frame']}"

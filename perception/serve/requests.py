@@ -11,6 +11,7 @@ from pydantic import Field
 
 from perception.config import Settings
 from perception.errors import InputError
+from perception.geometry import scale_of
 from perception.query import Frame, Hit, QueryMap, Where
 from perception.query.hit import answer_json
 from perception.query.requests import TOP, UnknownInstance, check_prompt
@@ -106,9 +107,11 @@ def error_line(error: BaseException | str) -> str:
 
 
 def source(gmap: QueryMap, frame: Frame | None = None) -> dict[str, Any]:
-    """The facts of the map in every answer: the frame of its coordinates, whether they are metres, the map's id. Frame
-    and metres of a store's answer are None, and are given with each hit."""
-    return {"frame": frame.name if frame else gmap.frame, "metric": gmap.metric, "map_id": gmap.map_id}
+    """The facts of the map in every answer: the frame of its coordinates, whether they are metres (not in a frame that
+    scales those of the map), the map's id. Frame and metres of a store's answer are None, and are given with each hit.
+    """
+    metric = gmap.metric and (frame is None or abs(scale_of(frame.from_map) - 1) < 1e-6)
+    return {"frame": frame.name if frame else gmap.frame, "metric": metric, "map_id": gmap.map_id}
 
 
 @dataclass(frozen=True)

@@ -81,6 +81,20 @@ def test_a_query_answers_as_the_contract_says(client: TestClient, engine: QueryE
     assert single["results"] == [{"text": "nothing 7", "present": False, "hits": []}]
 
 
+def test_lengths_in_a_frame_with_a_scale_are_not_told_to_be_metres(client: TestClient) -> None:
+    for scale, metric in ((1.0, True), (1000.0, False)):
+        frame = {"name": "base", "from_map": np.diag([scale, scale, scale, 1.0]).tolist()}
+        for page, body in (("/query", {"text": "mug"}), ("/find", {}), ("/at", {"point": [0, 0, 0]})):
+            assert client.post(page, json={**body, "frame": frame}).json()["metric"] is metric
+
+
+def test_a_parameter_of_another_page_is_refused(client: TestClient) -> None:
+    refused(client.post("/query?at=0", json={"text": "mug"}), 400, "at", "map_id")
+    refused(client.get("/instances?top_k=3"), 400, "top_k", "map_id, at")
+    refused(client.post("/reload?map_id=x", json={}), 400, "map_id", "none")
+    assert client.get("/instances?at=0").status_code == client.get("/health?now=1").status_code == 200
+
+
 def test_filters_and_frames_pass_through(client: TestClient, engine: QueryEngine) -> None:
     where = {"region": {"min": [1.5, -0.5, -1], "max": [2.5, 0.5, 1]}, "min_size": 0.1}
     answer = client.post("/query", json={"text": "mug", "min_score": 0, "where": where}).json()
