@@ -98,7 +98,7 @@ def _query(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     opened = opened if args.at is None else opened.at(args.at)
     ways = (opened.query, opened.gone)
     answers = [(text, *(ask(text, args.top, args.min_score) for ask in ways)) for text in args.text]
-    of_store = any(hit.map is not None for _, hits, _ in answers for hit in hits)
+    of_store = opened.frame is None  # each hit has that of its map
     if args.points and of_store:
         raise InputError(f"{args.map}: is a store, whose maps have their own frames; give --points with one map")
     if args.points:
@@ -186,12 +186,7 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     if all(file is None for file in (args.output, args.mesh, args.voxels, args.graph, args.splat)):
         outputs = "-o OUT, --mesh OUT, --splat OUT.ply, --voxels OUT.npz or --graph OUT.json"
         raise InputError(f"export: nothing to write; give {outputs}")
-    if args.splat is None and (args.only or args.without or args.each):
-        raise InputError("export: --only, --without and --each choose what --splat writes; give --splat OUT.ply")
-    if args.output is None and args.points is not None:
-        raise InputError("export: --points labels a cloud; give the file to write it to with -o")
-    if args.instance is not None and args.mesh is None:
-        raise InputError("export: --instance selects what --mesh writes; give --mesh OUT")
+    _refuse_unused(args)
     if (args.mesh, args.voxels, args.voxel_size) != (None, None, None):
         from perception.export.mesh import check_outputs
 
@@ -232,6 +227,29 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     pose = args.transform or args.align
     result, table = export_map(args.map, args.output, args.points, options, args.color, pose, args.granularity)
     return {**facts, **result}, "\n".join([*lines, table])
+
+
+def _refuse_unused(args: argparse.Namespace) -> None:
+    """InputError for an option that nothing of what `export` is to write depends on."""
+    cloud = args.output is not None and args.output.suffix.lower() != ".spz"
+    scan, written = cloud and args.points is not None, "-o OUT (.ply, .pcd or .npz)"
+    uses = (
+        ("--only", args.only, args.splat, "--splat OUT.ply"),
+        ("--without", args.without, args.splat, "--splat OUT.ply"),
+        ("--each", args.each, args.splat, "--splat OUT.ply"),
+        ("--instance", args.instance is not None, args.mesh, "--mesh OUT"),
+        ("--voxel-size", args.voxel_size is not None, args.mesh or args.voxels, "--mesh OUT or --voxels OUT.npz"),
+        ("--points", args.points, args.output, written),
+        ("--granularity", args.granularity != "default", cloud, written),
+        ("--color", args.color != "original", cloud or args.mesh, f"{written} or --mesh OUT"),
+        ("--align", args.align, scan, f"--points CLOUD {written}"),
+        ("--transform", args.transform, scan, f"--points CLOUD {written}"),
+        ("--segments", args.segments, scan, f"--points CLOUD {written}"),
+        ("--max-distance", args.max_distance is not None, scan, f"--points CLOUD {written}"),
+    )
+    for name, given, used, needed in uses:
+        if given and not used:
+            raise InputError(f"export: {name} changes nothing without {needed}; give that too, or leave {name} out")
 
 
 def _render(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

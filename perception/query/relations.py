@@ -129,7 +129,7 @@ class LevelBoxes:
 
     def match(self, kind: str) -> np.ndarray:
         """g [I, I] in [0, 1]: how well the row's instance is in the relation to the column's; 0 to itself."""
-        return self._match(kind) * (1 - np.eye(len(self.lows)))
+        return self._match(kind) * (1 - np.eye(len(self.lows))) if len(self.lows) else np.zeros((0, 0))
 
     def _match(self, kind: str) -> np.ndarray:
         low, high = self.lows[:, None], self.highs[:, None]

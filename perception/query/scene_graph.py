@@ -230,4 +230,4 @@ def write_graph(gmap: Map, path: Path) -> tuple[dict[str, Any], str]:
     kinds = Counter(kind for _, kind in graph.nodes(data="kind"))
     relations = Counter(relation for _, _, relation in graph.edges(data="relation"))
     counts = ", ".join(f"{count} {name}" for name, count in (*sorted(kinds.items()), *sorted(relations.items())))
-    return {"path": str(path), "nodes": dict(kinds), "edges": dict(relations)}, f"{path}: {counts}"
+    return {"path": str(path), "nodes": dict(kinds), "edges": dict(relations)}, f"{path}: {counts or 'no instance'}"

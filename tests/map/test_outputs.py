@@ -132,6 +132,25 @@ def test_what_a_map_was_made_from_is_not_written_over(place: Path, capsys: pytes
     assert [file.read_text() for file in labels] == ["by hand"] * 2 and (place / "scan.ply").read_bytes() == scan
 
 
+@pytest.mark.parametrize(
+    "option", ["--align", "--transform t", "--segments s", "--max-distance 0", "--granularity parts"]
+)
+@pytest.mark.parametrize("output", ["--graph g.json", "--mesh m.ply", "-o new.spz"])
+def test_an_option_that_changes_nothing_that_is_written_is_refused(
+    option: str, output: str, place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = contents(place)
+    assert main(["export", "m.gsmap", *output.split(), *option.split()]) == 2
+    name, told = option.split()[0], capsys.readouterr().err
+    assert f"{name} changes nothing" in told and told.count("\n") == 1 and contents(place) == before
+
+
+@pytest.mark.parametrize("option", ["--only 0", "--each", "--voxel-size 1", "--instance 0", "--max-distance 1"])
+def test_an_option_of_another_output_is_refused(option: str, place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", "m.gsmap", "-o", "new.ply", *option.split()]) == 2
+    assert f"{option.split()[0]} changes nothing" in capsys.readouterr().err and not (place / "new.ply").exists()
+
+
 @pytest.mark.parametrize("name", ["pipe.ply", "pipe.npy", "pipe.json"])
 def test_a_named_pipe_is_neither_replaced_nor_waited_for(
     name: str, place: Path, capsys: pytest.CaptureFixture[str]

@@ -146,6 +146,14 @@ def test_the_graph_is_written_as_json(tmp_path: Path) -> None:
     assert read.graph["metric"] is True and read.nodes[3]["label"] == "book"
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_map_without_instances_has_an_empty_graph(tmp_path: Path) -> None:
+    gmap = made(THINGS)
+    gmap.instances, gmap.instance_ids = [], np.full(len(gmap), -1, np.int32)
+    assert write_graph(gmap, tmp_path / "graph.json")[1].endswith("graph.json: no instance")
+    assert len(networkx.node_link_graph(json.loads((tmp_path / "graph.json").read_text()), edges="edges")) == 0
+
+
 def test_without_up_there_is_no_graph() -> None:
     gmap = made(THINGS, gravity=None)
     gmap.views = []

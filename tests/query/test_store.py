@@ -316,8 +316,10 @@ def test_the_commands(maps: list[Path], tmp_path: Path, monkeypatch: pytest.Monk
         assert hit == {**same, **more, "frame": alone["frame"], "metric": alone["metric"]}
     assert main(["query", store, "grandma's cup"]) == 0
     assert f" in {maps[2]}" in capsys.readouterr().out
+    assert main(["query", store, absent]) == 0 and capsys.readouterr().out == f'"{absent}": not present\n'
     for words in (
         ["query", store, "mug", "--min-score", "0", "--points", "x.ply"],
+        ["query", store, absent, "--points", "x.ply"],
         ["info", store],
         ["index", "-o", store],
     ):
