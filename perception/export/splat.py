@@ -37,7 +37,7 @@ def export_splat(
     known = [entry["id"] for entry in gmap.instances if not is_removed(entry)]
     for number in (*only, *without):
         if number not in known:
-            raise InputError(f"{map_path}: has no instance {number}; `perception query` and `info` list those it has")
+            raise InputError(f"{map_path}: has no Gaussians of an instance {number}; `perception query` tells ids")
     rows = _rows(gmap, map_path)
     wanted = [number for number in only or known if number not in without]
     files = {output: np.isin(ids, wanted) if only else ~np.isin(ids, without)}

@@ -11,9 +11,11 @@ import pytest
 from perception.colors import instance_palette
 from perception.errors import InputError
 from perception.export.export_map import ExportOptions, export_map
+from perception.export.splat import export_splat
 from perception.io.cloud import read_cloud
 from perception.map.write import write_map
 from support.viewer_maps import small_map
+from support.visited_map import STATES, number, write_visited_map
 
 
 def test_all_that_was_asked_for_is_written(tmp_path: Path) -> None:
@@ -56,3 +58,12 @@ def test_order_number_and_columns_of_a_scan_are_kept(suffix: str, smooth: bool, 
     assert facts["points"] == 60 and back.labels["instance_id"][[7, 30]].tolist() == [-1, -1]
     assert (back.labels["instance_id"] >= 0).any() and 99 not in back.labels["instance_id"]
     assert ("stamp" in back.labels) == (suffix == "npz") == ("left_out" not in facts) == ("stamp" not in table)
+
+
+def test_what_is_gone_has_no_splat(tmp_path: Path) -> None:
+    path = write_visited_map(tmp_path / "a.gsmap")
+    facts, _ = export_splat(path, tmp_path / "s.ply", each=True)
+    written = {tmp_path / f"s-{number(name)}.ply" for name, state in STATES.items() if state != "removed"}
+    assert {Path(file) for file in facts["splat"]} == written == set(tmp_path.glob("s*.ply"))
+    with pytest.raises(InputError, match=f"no Gaussians of an instance {number('mug')}"):
+        export_splat(path, tmp_path / "s.ply", only=[number("mug")])
