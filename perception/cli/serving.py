@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from perception.cli.parser import map_command
+from perception.errors import InputError
 from perception.progress import Progress
 
 
@@ -73,6 +74,8 @@ def _mcp(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.serve.mcp import serve_http, serve_stdio
 
     if args.http is None:
+        if args.token_file is not None:
+            raise InputError("mcp: --token-file is for HTTP clients; give --http HOST:PORT too, or leave it out")
         serve_stdio(args.map, photos=args.photos)
     else:
         host, _, port = args.http.rpartition(":")

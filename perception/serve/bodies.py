@@ -103,7 +103,7 @@ class WhereBody(Body):
 class FrameBody(Body):
     """A frame's name and its transform frame_from_map: a rotation, a scale and a translation."""
 
-    name: Text
+    name: Prompt
     from_map: Matrix
 
     def frame(self) -> Frame:

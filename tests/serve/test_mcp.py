@@ -449,6 +449,7 @@ def test_bad_use_ends_with_one_line(
         ([path, "--http", "8766"], "host"),
         ([path, "--http", "127.0.0.1:http"], "port: found 'http', expected a whole number from 0 to 65535"),
         ([path, "--http", "0.0.0.0:0"], "token"),
+        ([path, "--token-file", str(tmp_path / "none")], "--http HOST:PORT"),
     ):
         assert main(["mcp", *words]) == 2
         error = capsys.readouterr().err

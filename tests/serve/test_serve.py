@@ -211,6 +211,7 @@ def test_requests_that_the_document_describes_are_answered(client: TestClient) -
         (b'{"text": "mug", "where": {"labels": {"a": 1}}}', "labels"),
         (b'{"text": "mug", "frame": "base"}', "frame"),
         (b'{"text": "mug", "frame": {"name": "b", "from_map": [[1]]}}', "frame"),
+        (f'{{"text": "mug", "frame": {{"name": "", "from_map": {np.eye(4).tolist()}}}}}'.encode(), "frame.name"),
     ],
 )
 def test_bad_bodies_are_told_in_one_line(client: TestClient, body: bytes, word: str) -> None:
