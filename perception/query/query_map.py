@@ -24,7 +24,16 @@ from perception.query.ranking import Ranker, answering
 from perception.query.requests import MAX_TOP, TOP, UnknownInstance, check_prompt
 from perception.query.spatial_index import SpatialIndex
 from perception.query.text_ranking import Encoders, TextRanking
-from perception.query.where import Frame, Where, position_of, tidy
+from perception.query.where import (
+    Frame,
+    Where,
+    check_box,
+    check_frame,
+    check_length,
+    position_of,
+    tidy,
+    wanted_in_map,
+)
 from perception.types import DepthImage, Lens, OrientedBox, View
 
 if TYPE_CHECKING:
@@ -118,7 +127,7 @@ class QueryMap(Map):
         check_prompt(text, top_k, min_score)
         if not self.instances:
             return []
-        ranked, wanted = self._ranking.rank(text).hits, (where or Where()).in_map(frame)
+        ranked, wanted = self._ranking.rank(text).hits, wanted_in_map(where, frame)
         chosen: list[Candidate] = list(ranked)
         if where is not None:
             allowed = set(self._fulfilling(wanted))
@@ -133,21 +142,21 @@ class QueryMap(Map):
 
     def find(self, where: Where | None = None, *, frame: Frame | None = None) -> list[Hit]:
         """All instances that fulfil `where`, in the order of instances.json, scored by the mapper's confidence."""
-        wanted = (where or Where()).in_map(frame)
+        wanted = wanted_in_map(where, frame)
         return [_in(frame, self._measured(n, wanted)) for n in self._fulfilling(wanted)]
 
     def in_box(self, box: OrientedBox, *, share: float = 0.5, frame: Frame | None = None) -> list[Hit]:
         """The instances with at least `share` of their points in `box` (`axis_box`: a box along the axes)."""
-        return self.find(Where(region=box, share=share), frame=frame)
+        return self.find(Where(region=check_box(box), share=share), frame=frame)
 
     def nearest(
         self, near: np.ndarray, top_k: int = 1, *, where: Where | None = None, frame: Frame | None = None
     ) -> list[Hit]:
         """The top_k instances nearest to a point [3] or a pose [4, 4] by their nearest point, nearest first, each hit
         with its `distance`. `where` keeps only instances that fulfil it. Raises InputError for top_k below 1."""
-        if top_k < 1:
-            raise InputError(f"nearest: top_k is {top_k}, expected at least 1")
-        wanted = (where or Where()).in_map(frame)
+        if isinstance(top_k, bool) or not isinstance(top_k, (int, np.integer)) or top_k < 1:
+            raise InputError(f"nearest: top_k is {top_k!r}, expected a whole number of at least 1")
+        wanted = wanted_in_map(where, frame)
         point = _in_map(near, frame)
         ids = [int(self.instances[n]["id"]) for n in self._fulfilling(wanted)]
         nearest = self._spatial.nearest(point, top_k, ids)
@@ -158,6 +167,7 @@ class QueryMap(Map):
     ) -> Hit | None:
         """The instance that `point` [3] lies on: the one with the nearest point, if that is at most `max_distance`
         away; when None, no farther than the spacing of the instance's points there (see `SpatialIndex.reaches`)."""
+        check_length("instance_at: max_distance", max_distance)
         for hit in self.nearest(point, 1, frame=frame):
             if max_distance is not None and hit.distance is not None:
                 return hit if hit.distance <= max_distance else None
@@ -223,6 +233,7 @@ class QueryMap(Map):
     ) -> list[Hit]:
         """As `query`, the instances that are gone and answer `text` when they are compared with all others: hits where
         they stood last, with `since` and, where it is known, what they `stood` on."""
+        check_prompt(text, top_k, min_score)
         spots, hits = self._left, list[Hit]()
         for hit in self.last_known.query(text, MAX_TOP, min_score, where=where, frame=frame) if spots else ():
             if hit.instance_id in spots and len(hits) < top_k:
@@ -377,6 +388,7 @@ class QueryMap(Map):
 
 def _in(frame: Frame | None, hit: Hit) -> Hit:
     """A hit of the map in `frame`; None: in the map's own."""
+    check_frame(frame)
     return hit if frame is None else hit.transformed(frame.from_map, frame.name)
 
 

@@ -32,6 +32,8 @@ class Frame:
     from_map: np.ndarray
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise InputError(f"frame: the name is {self.name!r}, expected a text")
         object.__setattr__(self, "from_map", check_similarity(self.from_map, f"frame '{self.name}'"))
 
     @property
@@ -68,16 +70,12 @@ class Where:
         if self.near is not None:
             object.__setattr__(self, "near", position_of(self.near))
         if self.labels is not None:
-            names = [self.labels] if isinstance(self.labels, str) else list(self.labels)
-            if not all(isinstance(name, str) for name in names):
-                raise InputError(f"where: labels are {names[:3]}, expected texts")
+            names = [self.labels] if isinstance(self.labels, str) else self.labels
+            if not isinstance(names, Collection) or not all(isinstance(name, str) for name in names):
+                raise InputError(f"where: labels are {names!r:.80}, expected texts")
             object.__setattr__(self, "labels", frozenset(tidy(name) for name in names))
         for name in ("share", "within", "min_size", "max_size"):
-            value = getattr(self, name)
-            if value is not None and (isinstance(value, bool) or not isinstance(value, (int, float, np.number))):
-                raise InputError(f"where: {name} is {value!r}, expected a number")
-            if value is not None and not 0 <= value < np.inf:
-                raise InputError(f"where: {name} is {value}, expected a number of at least 0")
+            check_length(f"where: {name}", getattr(self, name))
         if not 0 < self.share <= 1:
             raise InputError(f"where: share is {self.share}, expected more than 0 and at most 1")
         if self.within is not None and self.near is None:
@@ -98,6 +96,28 @@ class Where:
         if self.near is not None:
             moved["near"] = move_points(frame.to_map, np.asarray(self.near))
         return replace(self, **moved)
+
+
+def wanted_in_map(where: Where | None, frame: Frame | None) -> Where:
+    """The filter of a question in the map's frame, given the frame of the question; InputError for other types."""
+    if where is not None and not isinstance(where, Where):
+        raise InputError(f"where: found {type(where).__name__}, expected a Where")
+    check_frame(frame)
+    return (where or Where()).in_map(frame)
+
+
+def check_frame(frame: Any) -> None:
+    """InputError unless it is a Frame or None."""
+    if frame is not None and not isinstance(frame, Frame):
+        raise InputError(f"frame: found {type(frame).__name__}, expected a Frame(name, from_map)")
+
+
+def check_length(name: str, value: Any) -> None:
+    """InputError unless it is a number of at least 0, or None."""
+    if value is not None and (isinstance(value, bool) or not isinstance(value, (int, float, np.number))):
+        raise InputError(f"{name} is {value!r}, expected a number")
+    if value is not None and not 0 <= value < np.inf:
+        raise InputError(f"{name} is {value}, expected a number of at least 0")
 
 
 def position_of(point_or_pose: Any) -> np.ndarray:

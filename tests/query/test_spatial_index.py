@@ -227,6 +227,17 @@ def test_a_description_names_neighbours_by_their_gap(gmap: QueryMap, arrays: Map
         lambda g: g.get(3).transformed(np.eye(3)),
         lambda g: g.get(3).transformed(np.full((4, 4), np.nan)),
         lambda g: g.get(3, frame=Frame("a", np.zeros((4, 4)))),
+        lambda g: g.get(3, frame="base_link"),
+        lambda g: g.query("mug", frame=np.eye(4)),
+        lambda g: g.query("mug", where={"labels": ["mug"]}),
+        lambda g: g.nearest([0, 0, 0], 1.5),
+        lambda g: g.nearest([0, 0, 0], frame="base_link"),
+        lambda g: g.instance_at([0, 0, 0], max_distance=float("nan")),
+        lambda g: g.instance_at([0, 0, 0], max_distance=-1),
+        lambda g: g.in_box(None),  # not all instances
+        lambda g: g.find(Where(labels=3)),
+        lambda g: g.gone("mug", top_k=0),
+        lambda g: Frame(3, np.eye(4)),
     ],
 )
 def test_bad_questions_are_told_in_one_line(gmap: QueryMap, ask) -> None:
