@@ -8,13 +8,12 @@ of all are cut into pieces that none divides, and these are joined as most segme
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from scipy import sparse
 
 from perception.masks.consensus import best_cut, dendrogram, node_evidence
-from perception.masks.merging import Segmentation
+from perception.masks.merging import Segmentation, nested
 from perception.masks.votes import MaskVotes
 
 
@@ -49,7 +48,9 @@ def averaged(first: Segmentation, others: Sequence[tuple[np.ndarray, np.ndarray]
     order = order[sizes[order] > 0]
     rank = np.zeros(len(sizes), np.int32)
     rank[order] = np.arange(1, len(order) + 1)
-    return _with_segments(first, rank[owner[piece.reshape(-1)]], np.append(0, odds[order]))
+    parts = first.part, first.part_probability
+    groups = first.group[first.segment], first.group_probability
+    return nested(first.points, rank[owner[piece.reshape(-1)]], np.append(0, odds[order]), parts, groups)
 
 
 def _votes(rows: np.ndarray, voxels: np.ndarray, counts: Sequence[int]) -> MaskVotes:
@@ -63,21 +64,3 @@ def _votes(rows: np.ndarray, voxels: np.ndarray, counts: Sequence[int]) -> MaskV
     void = sparse.csr_matrix((weight[~known], (piece[~known], each[~known])), shape=(pieces, many))
     area = np.asarray(pixels.sum(axis=0), np.float64).reshape(-1)
     return MaskVotes(pixels, void, np.repeat(np.arange(many), counts), area)
-
-
-def _with_segments(first: Segmentation, segment: np.ndarray, probability: np.ndarray) -> Segmentation:
-    """`first` with other segments: its parts where these cross them, and of its groups that of most of their voxels."""
-    width = len(first.part_probability)
-    pairs, part = np.unique(segment * np.int64(width) + first.part, return_inverse=True)
-    shared = np.zeros((len(probability), len(first.group_probability)), np.int64)
-    np.add.at(shared, (segment, first.group[first.segment]), 1)
-    groups, group = np.unique(shared.argmax(axis=1), return_inverse=True)
-    return replace(
-        first,
-        segment=segment,
-        probability=probability,
-        part=part,
-        part_probability=first.part_probability[pairs % width],
-        group=group,
-        group_probability=first.group_probability[groups],
-    )

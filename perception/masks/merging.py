@@ -85,6 +85,10 @@ def read_model(file: Path = WEIGHTS) -> MergeModel:
     return MergeModel(Network(tuple(arrays[:_ARRAYS])), Network(tuple(arrays[_ARRAYS:])), cost, (slope, offset))
 
 
+Regions = tuple[np.ndarray, np.ndarray]
+"""The region [V] of each voxel, and the probability of each region."""
+
+
 @dataclass(frozen=True)
 class Segmentation:
     """Three cuts of a surface of V voxels into segments, their parts, and groups of them.
@@ -111,12 +115,23 @@ def segmentation(graph: SurfaceGraph) -> Segmentation:
     segment, probability = divided(graph, tree, model)
     p, calibrated = model.probabilities(tree)
     fine, coarse = (tree.cut(p - cost)[graph.patch] for cost in (model.cost * PART_COST, GROUP_COST))
-    pairs, part = np.unique(segment * np.int64(len(p)) + fine, return_inverse=True)
-    shared = np.zeros((len(probability), len(p)), np.int32)  # voxels of each segment in each region
-    np.add.at(shared, (segment, coarse), 1)
-    groups, group = np.unique(shared.argmax(axis=1), return_inverse=True)
     points = graph.surface.points.astype(np.float32)
-    return Segmentation(points, segment, probability, part, calibrated[pairs % len(p)], group, calibrated[groups])
+    return nested(points, segment, probability, (fine, calibrated), (coarse, calibrated))
+
+
+def nested(
+    points: np.ndarray, segment: np.ndarray, probability: np.ndarray, fine: Regions, coarse: Regions
+) -> Segmentation:
+    """The segments of a `Segmentation`; their parts, where they cross the regions of a finer cut; and their groups, the
+    regions of a coarser cut with most of their voxels."""
+    region, of_region = fine
+    pairs, part = np.unique(segment * np.int64(len(of_region)) + region, return_inverse=True)
+    part_probability = of_region[pairs % len(of_region)]
+    region, of_region = coarse
+    shared = np.zeros((len(probability), len(of_region)), np.int64)  # voxels of each segment in each region
+    np.add.at(shared, (segment, region), 1)
+    groups, group = np.unique(shared.argmax(axis=1), return_inverse=True)
+    return Segmentation(points, segment, probability, part, part_probability, group, of_region[groups])
 
 
 def tree_by(model: MergeModel, graph: SurfaceGraph) -> MergeTree:

@@ -15,6 +15,7 @@ import numpy as np
 from perception import _core
 from perception.io.memory import Keep
 from perception.masks.cues import DepthCues, PhotoCues, depth_cues, filled_depth, photo_cues
+from perception.photos.decode import scaled_K
 from perception.progress import QUIET, Progress
 from perception.types import View
 
@@ -82,7 +83,7 @@ def make_stereo_view(view: View, photo: np.ndarray, depth: np.ndarray, keep: Kee
         return None
     small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA if ratio < 1 else cv2.INTER_LINEAR)
     prior = cv2.resize(np.where(known, depth, 0).astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
-    K = np.diag([size[0] / view.width, size[1] / view.height, 1.0]) @ view.K
+    K = scaled_K(view, *size)
     grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
     pose = np.asarray(view.camera_from_world, np.float64)
     measured = view.depth is not None
