@@ -28,14 +28,9 @@ a pose."""
 _SPARSE, _DISTORTED, _PHOTOS = "sparse", "distorted", ("images", "input")
 
 
-def is_workspace(folder: Path) -> bool:
-    """True for a folder that holds a sparse model somewhere."""
-    return bool(models_below(folder))
-
-
 def models_below(folder: Path) -> list[Path]:
     """The folders with a sparse model, in order of preference: in `sparse`, then by depth and name. Models in one
-    `sparse` are parts of one reconstruction, or its attempts."""
+    `sparse` are parts of one reconstruction, or its attempts. [] for a folder without one."""
     if not folder.is_dir():
         return []
     found = []

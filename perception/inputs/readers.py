@@ -10,7 +10,7 @@ from pathlib import Path
 
 from perception.errors import InputError
 from perception.inputs import recordings
-from perception.inputs.colmap import is_workspace, model_files, model_photos, models_below, read_workspace
+from perception.inputs.colmap import model_files, model_photos, models_below, read_workspace
 from perception.inputs.layouts import layout_of, open_recording, refuse_depth_without_poses, text_files
 from perception.inputs.transforms import (
     faults,
@@ -52,8 +52,8 @@ class Reader:
     sizes: Callable[[Path], PhotoSizes]
     files: Callable[[Path], list[Path]]
     read: Callable[[Path, ReadOptions], Scene]
-    poses: bool
-    cameras: bool
+    poses: bool = False
+    cameras: bool = False
 
 
 def _sizes(photos: Sequence[Path], depth: bool = False) -> PhotoSizes:
@@ -67,6 +67,10 @@ def _sizes(photos: Sequence[Path], depth: bool = False) -> PhotoSizes:
 
 def _is_video(source: Path) -> bool:
     return source.suffix.lower() in VIDEO_SUFFIXES and source.is_file()
+
+
+def _is_splat(source: Path) -> bool:
+    return source.suffix.lower() in (".ply", ".spz") and source.is_file()
 
 
 def _video_sizes(source: Path) -> PhotoSizes:
@@ -122,10 +126,10 @@ def _refuse_splat(source: Path, options: ReadOptions) -> Scene:
 
 
 READERS = (
-    Reader("video", _is_video, _video_sizes, lambda source: [source], _read_video, poses=False, cameras=False),
+    Reader("video", _is_video, _video_sizes, lambda source: [source], _read_video),
     Reader(
         "COLMAP model",
-        is_workspace,
+        lambda source: bool(models_below(source)),
         lambda source: _sizes(model_photos(source)),
         lambda source: [*model_photos(source), *model_files(source)],
         read_workspace,
@@ -148,26 +152,9 @@ READERS = (
         _recording_files,
         lambda source, options: recordings.recorded_scene(open_recording(source), options),
         poses=True,
-        cameras=False,
     ),
-    Reader(
-        "photos",
-        Path.is_dir,
-        lambda source: _sizes(list_photos(source)),
-        list_photos,
-        _read_photos,
-        poses=False,
-        cameras=False,
-    ),
-    Reader(
-        "splat",
-        lambda source: source.suffix.lower() in (".ply", ".spz") and source.is_file(),
-        lambda source: PhotoSizes([], "no photos"),
-        lambda source: [source],
-        _refuse_splat,
-        poses=False,
-        cameras=False,
-    ),
+    Reader("photos", Path.is_dir, lambda source: _sizes(list_photos(source)), list_photos, _read_photos),
+    Reader("splat", _is_splat, lambda source: PhotoSizes([], "no photos"), lambda source: [source], _refuse_splat),
 )
 EXPECTED = (
     "a folder of photos, a video, a COLMAP workspace, a transforms.json, an RGB-D recording (TUM, ScanNet, 7-Scenes, "
