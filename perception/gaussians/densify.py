@@ -12,7 +12,7 @@ colour there, at a depth taken from the nearest covered blocks. Training then mo
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -222,12 +222,10 @@ def _in_holes(
     low = empty * BLOCK
     high = np.minimum(low + BLOCK, [height, width])
     rows, columns = ((low + high) / 2).T
-    K = view.K.numpy()
-    means = unprojected(K, view.camera_from_world.double().numpy(), columns, rows, depth)
+    means = unprojected(view.K.numpy(), view.camera[1], columns, rows, depth)
     colors = _block_mean(view.photo.float().permute(2, 0, 1))
     rgb = colors[:, torch.from_numpy(holes)].T / 255
-    scales = torch.from_numpy(depth) * (0.5 * BLOCK / float(K[0, 0]))
+    scales = torch.from_numpy(depth) * (0.5 * BLOCK / float(view.K[0, 0]))
     log_scales = scales.clamp(min=1e-9).log()
     balls = isotropic(means, log_scales, rgb, HOLE_OPACITY, like.features.shape[1], generator)
-    harmonics = balls.sh.new_zeros(len(empty), like.sh.shape[1] - 1, 3)
-    return replace(balls, sh=torch.cat([balls.sh, harmonics], dim=1))
+    return balls.with_coefficients(like.sh.shape[1])

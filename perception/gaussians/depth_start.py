@@ -114,7 +114,7 @@ def _samples(view: TrainingView, every: int) -> tuple[np.ndarray, np.ndarray, np
     known = (z[row, column] > 0) & (_facing(z, K)[row, column] > STEEPEST)
     row, column = row[known], column[known]
     depth = z[row, column]
-    points = unprojected(K, view.camera_from_world.double().numpy(), column + 0.5, row + 0.5, depth)
+    points = unprojected(*view.camera, column + 0.5, row + 0.5, depth)
     return points, view.photo.numpy()[row, column], depth**-4.0, depth / K[0, 0]
 
 
@@ -147,18 +147,13 @@ def _voxels(
 
 def _consistent(points: np.ndarray, side: float, views: list[TrainingView]) -> np.ndarray:
     """[P] bool: whether at least as many views measured each point as measured something behind it."""
-    columns = np.ascontiguousarray(points.T)
+    points = np.asfortranarray(points)  # by column, as they are read
 
     def judged(view: TrainingView) -> tuple[np.ndarray, np.ndarray]:
         """Points [M] in the image, and whether the view measured each there (1) or something behind it (−1)."""
         assert view.depth is not None
-        depth, K, pose = view.depth.numpy(), view.K.double().numpy(), view.camera_from_world.double().numpy()
-        x, y, z = (columns[0] * a + columns[1] * b + columns[2] * c + t for a, b, c, t in pose[:3].tolist())
-        ahead = z > 0
-        column, row = (np.floor(K[i, i] * c / np.where(ahead, z, 1) + K[i, 2]) for i, c in ((0, x), (1, y)))
-        inside = ahead & (column >= 0) & (row >= 0) & (column < depth.shape[1]) & (row < depth.shape[0])
-        shown = np.flatnonzero(inside)
-        theirs = depth[row[shown].astype(np.int64), column[shown].astype(np.int64)].astype(np.float64)
+        shown, pixels, z = view.seen(points)
+        theirs = view.depth.numpy()[tuple(pixels)].astype(np.float64)
         slack, behind = AGREE * theirs + side / 2, theirs - z[shown]
         return shown, np.where(theirs > 0, (np.abs(behind) <= slack) * 1 - (behind > slack), 0)
 

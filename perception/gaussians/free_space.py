@@ -70,11 +70,7 @@ class FreeSpace:
 
 def _ball(points: np.ndarray, view: TrainingView) -> tuple[np.ndarray, float]:
     """Centre [3] of the camera, and the radius around it; 0 where its photo shows no point."""
-    K, pose = view.K.double().numpy(), view.camera_from_world.double().numpy()
-    x, y, z = ((points[:, None] * pose[:3, :3]).sum(axis=2) + pose[:3, 3]).T  # rounded alike with any threads
-    depth = np.where(z > 0, z, 1)
-    column, row = K[0, 0] * x / depth + K[0, 2], K[1, 1] * y / depth + K[1, 2]
-    height, width = view.photo.shape[:2]
-    inside = (z > 0) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
-    radius = REACH * float(np.quantile(z[inside], NEAREST)) if inside.any() else 0.0
+    inside, _, z = view.seen(points)
+    radius = REACH * float(np.quantile(z[inside], NEAREST)) if len(inside) else 0.0
+    pose = view.camera[1]
     return -pose[:3, :3].T @ pose[:3, 3], radius

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -83,6 +83,11 @@ class Gaussians:
     def rows(self, index: torch.Tensor) -> Gaussians:
         """Copies of the rows `index` [M] int64 selects, in its order."""
         return Gaussians(**{name: tensor.index_select(0, index) for name, tensor in self.named().items()})
+
+    def with_coefficients(self, count: int) -> Gaussians:
+        """The same Gaussians with `count` ≥ K spherical-harmonic coefficients, the new ones 0."""
+        more = self.sh.new_zeros(len(self), count - self.sh.shape[1], 3)
+        return replace(self, sh=torch.cat([self.sh, more], dim=1))
 
     @staticmethod
     def concatenate(parts: list[Gaussians]) -> Gaussians:

@@ -31,26 +31,19 @@ OPACITY = 0.9  # of those placed; training has little time left to strengthen th
 @dataclass(frozen=True)
 class _Seen:
     """A photo as the map shows it. labels [H, W] int; depth [H, W], 0 = none; area [M] and own [M]: pixels and
-    Gaussians of each mask, 0 for label 0; K [3, 3] and pose [4, 4], float64."""
+    Gaussians of each mask, 0 for label 0; focal length in pixels."""
 
     view: TrainingView
     labels: np.ndarray
     depth: np.ndarray
     area: np.ndarray
     own: np.ndarray
-    K: np.ndarray
-    pose: np.ndarray
+    focal: float
 
     def shown(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Label [P] and depth z [P] of each of points [P, 3]; label 0 where the photo does not show its surface."""
-        K = self.K
-        x, y, z = (r[0] * points[:, 0] + r[1] * points[:, 1] + r[2] * points[:, 2] + r[3] for r in self.pose[:3])
-        ahead = np.where(z > 1e-6, z, np.inf)
-        with np.errstate(invalid="ignore"):
-            column, row = K[0, 0] * x / ahead + K[0, 2], K[1, 1] * y / ahead + K[1, 2]
-        height, width = self.labels.shape
-        inside = np.flatnonzero((z > 1e-6) & (column >= 0) & (row >= 0) & (column < width) & (row < height))
-        pixel, label = (row[inside].astype(int), column[inside].astype(int)), np.zeros(len(points), self.labels.dtype)
+        inside, pixels, z = self.view.seen(points)
+        pixel, label = tuple(pixels), np.zeros(len(points), self.labels.dtype)
         near = np.abs(self.depth[pixel] - z[inside]) < NEAR * z[inside]
         label[inside] = np.where(near, self.labels[pixel], 0)
         return label, z
@@ -60,7 +53,7 @@ class _Seen:
 def for_starved_masks(gaussians: Gaussians, views: list[TrainingView], seed: int) -> Gaussians:
     """The Gaussians to add; at most MOST of the N given."""
     like = gaussians.to(torch.device("cpu"))
-    labelled = [view for view in views if view.labels is not None and bool((view.labels > 0).any())]
+    labelled = [view for view in views if view.labelled]
     means, widest = like.means.double().numpy(), like.log_scales.amax(dim=1).exp().numpy()
     seen = list(in_threads(partial(_seen, like, means, widest, like.opacities.numpy() >= SOLID), labelled))
     lacking = [np.flatnonzero((one.area >= LEAST_PIXELS) & (one.own < OWN)).tolist() for one in seen]
@@ -76,8 +69,8 @@ def for_starved_masks(gaussians: Gaussians, views: list[TrainingView], seed: int
         if served >= OWN or len(pixels) < OWN / 2:
             continue
         z = seen[k].depth[tuple(pixels.T)]
-        new = unprojected(seen[k].K, seen[k].pose, pixels[:, 1] + 0.5, pixels[:, 0] + 0.5, z)
-        pixel = float(np.median(z)) / seen[k].K[0, 0]
+        new = unprojected(*seen[k].view.camera, pixels[:, 1] + 0.5, pixels[:, 0] + 0.5, z)
+        pixel = float(np.median(z)) / seen[k].focal
         if any(_confirms(other, new, pixel, int(seen[k].area[mask])) for j, other in enumerate(seen) if j != k):
             placed.append((k, pixels))
             points = np.concatenate([points, new])
@@ -91,10 +84,9 @@ def _seen(gaussians: Gaussians, means: np.ndarray, widest: np.ndarray, solid: np
     depth = surface_depth(gaussians, replace(view, depth=None))
     area = np.bincount(labels.ravel())
     area[0] = 0
-    K, pose = view.K.double().numpy(), view.camera_from_world.double().numpy()
-    one = _Seen(view, labels, depth, area, np.zeros(len(area), np.int64), K, pose)
+    one = _Seen(view, labels, depth, area, np.zeros(len(area), np.int64), float(view.K[0, 0]))
     label, z = one.shown(means)
-    fits = solid & (widest * float(view.K[0, 0]) / np.maximum(z, 1e-6) <= WITHIN * np.sqrt(area[label] / np.pi))
+    fits = solid & (widest * one.focal / np.maximum(z, 1e-6) <= WITHIN * np.sqrt(area[label] / np.pi))
     return replace(one, own=np.bincount(label[fits], minlength=len(area)))
 
 
@@ -115,7 +107,7 @@ def _confirms(other: _Seen, points: np.ndarray, pixel: float, area: int) -> bool
     label, z = other.shown(points)
     if np.count_nonzero(label) < AGREE * len(points):
         return False
-    expected = area * (pixel * other.K[0, 0] / float(np.median(z))) ** 2
+    expected = area * (pixel * other.focal / float(np.median(z))) ** 2
     alike = (other.area >= max(LEAST_PIXELS, expected / ALIKE)) & (other.area <= expected * ALIKE)
     return bool((np.bincount(label, minlength=len(alike)) * alike).max() >= AGREE * len(points))
 
@@ -130,8 +122,8 @@ def _made(
         gain = 1.0 if view.gain is None else view.gain.numpy()
         colors.append(view.photo.numpy()[tuple(pixels.T)] / 255 / gain)
         step = np.sqrt(seen[k].area[seen[k].labels[tuple(pixels.T)]] / len(pixels))
-        sizes.append(0.5 * step * depth / float(view.K[0, 0]))
+        sizes.append(0.5 * step * depth / seen[k].focal)
     rgb, scale = (torch.from_numpy(np.concatenate(rows).astype(np.float32)) for rows in (colors, sizes))
     generator = torch.Generator().manual_seed(seed)
     balls = isotropic(points, scale.clamp(min=1e-9).log(), rgb, OPACITY, like.features.shape[1], generator)
-    return replace(balls, sh=torch.cat([balls.sh, balls.sh.new_zeros(len(points), like.sh.shape[1] - 1, 3)], dim=1))
+    return balls.with_coefficients(like.sh.shape[1])

@@ -151,7 +151,7 @@ class TrainingState:
         """Sets the training views: the same photos as before, possibly with labels added."""
         self.views, self.coarse = views, [view.halved().stored() for view in views]
         self.long_side = max(max(view.photo.shape[:2]) for view in views)
-        self.has_labels = any(view.labels is not None and bool((view.labels > 0).any()) for view in views)
+        self.has_labels = any(view.labelled for view in views)
         self._on_device: dict[tuple[str, int], TrainingView] = {}  # those seen so far
         self._assigned: dict[str, LabelAssignment] = {}  # of the views seen so far
 

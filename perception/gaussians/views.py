@@ -39,6 +39,26 @@ class TrainingView:
     gain: torch.Tensor | None = None
     keep: Keep = np.asarray
 
+    @property
+    def labelled(self) -> bool:
+        """Whether any pixel has a label."""
+        return self.labels is not None and bool((self.labels > 0).any())
+
+    @property
+    def camera(self) -> tuple[np.ndarray, np.ndarray]:
+        """K [3, 3] and camera_from_world [4, 4], float64."""
+        return self.K.double().numpy(), self.camera_from_world.double().numpy()
+
+    def seen(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The rows [M] of points [P, 3] that lie before the camera and in the picture, and their pixels (row, column)
+        [2, M] int64; depth z [P] of all along the axis. Rounded alike with any number of threads."""
+        K, pose = self.camera
+        x, y, z = (points[:, 0] * a + points[:, 1] * b + points[:, 2] * c + t for a, b, c, t in pose[:3].tolist())
+        depth, (height, width) = np.where(z > 0, z, 1), self.photo.shape[:2]
+        column, row = K[0, 0] * x / depth + K[0, 2], K[1, 1] * y / depth + K[1, 2]
+        inside = np.flatnonzero((z > 0) & (column >= 0) & (row >= 0) & (column < width) & (row < height))
+        return inside, np.stack([row[inside], column[inside]]).astype(np.int64), z
+
     def stored(self) -> TrainingView:
         """The view with its images where `keep` puts them."""
         images = {name: getattr(self, name) for name in ("photo", "labels", "weight", "depth")}

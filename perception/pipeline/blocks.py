@@ -192,13 +192,12 @@ def nearby_rows(scene: Scene, blocks: Sequence[Block], counts: Sequence[int]) ->
 
 def joined(parts: Sequence[Gaussians]) -> Gaussians:
     """All Gaussians of the blocks. Features of different blocks are APART, as they are not comparable."""
-    degree = max(part.sh.shape[1] for part in parts)
+    count = max(part.sh.shape[1] for part in parts)
     padded = []
     for number, part in enumerate(parts):
         features = part.features.clone()
         features[:, 0] += APART * number
-        missing = part.sh.new_zeros(len(part), degree - part.sh.shape[1], 3)
-        padded.append(replace(part, features=features, sh=torch.cat([part.sh, missing], dim=1)))
+        padded.append(replace(part, features=features).with_coefficients(count))
     return Gaussians.concatenate(padded)
 
 

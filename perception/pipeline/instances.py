@@ -54,7 +54,7 @@ def group_gaussians(optimised: Optimised, run: Run, segments: Segmentation | Non
     """Groups Gaussians into instances by features and votes of all masks (§3.2.1); None if no photo has masks.
     segments: of the surface, if the masks come from one."""
     nearby, views, config = optimised.nearby, optimised.photos.views, run.config
-    if not any(view.labels is not None and bool((view.labels > 0).any()) for view in views):
+    if not any(view.labelled for view in views):
         return None
     run.progress.log(f"grouping {len(nearby.gaussians)} Gaussians")
     return_free_memory()

@@ -59,7 +59,7 @@ def train_features(
     in a new random order each epoch. Views without labels are left out."""
     losses, device = config.losses, gaussians.means.device
     shown = [view.halved() if losses.half_resolution else view for view in views]
-    shown = [view for view in shown if view.labels is not None and bool((view.labels > 0).any())]
+    shown = [view for view in shown if view.labelled]
     steps = feature_steps(config, len(views)) if shown else 0
     record, optimiser = TrainRecord(), SparseAdam({"features": gaussians.features})
     if checkpoints is not None and (state := checkpoints.load()) is not None:

@@ -18,7 +18,6 @@ from perception.errors import InputError, missing_extra
 from perception.machine import cores
 from perception.progress import Progress
 
-ENGINES = ("local", "ray")
 CONNECT = 10.0
 """Seconds in which a cluster must answer."""
 RETRIES = 5
@@ -58,7 +57,7 @@ def _join(ray: Any, address: str | None) -> None:
 
 @dataclass(frozen=True)
 class Engine:
-    """kind: of ENGINES. address: of a running Ray cluster ("auto": the one of this machine); None starts one here.
+    """kind: "local" or "ray". address: of a running Ray cluster ("auto": this machine's); None starts one here.
     Tasks get and leave their data in folders that every worker reaches under the same path. The results do not depend
     on the kind and on the number of workers."""
 

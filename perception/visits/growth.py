@@ -65,9 +65,7 @@ def new_surface(looks: Sequence[Look], like: Gaussians, budget: int, seed: int) 
         parts.append(from_points(carved.points[away], carved.colors[away], feature_dim=size, seed=seed, opacity=UNSURE))
     if not parts:
         return like.rows(torch.zeros(0, dtype=torch.long))
-    made = Gaussians.concatenate(parts)
-    more = made.sh.new_zeros(len(made), like.sh.shape[1] - 1, 3)
-    return replace(made, sh=torch.cat([made.sh, more], dim=1))
+    return Gaussians.concatenate(parts).with_coefficients(like.sh.shape[1])
 
 
 def update_config(config: MapConfig, photos: int, share: float, start: int) -> MapConfig:
