@@ -8,7 +8,6 @@ changed meanwhile is not overwritten.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ from perception.config import FrameConfig, InstanceConfig
 from perception.edit.scale import scale_map
 from perception.errors import InputError
 from perception.io.json_shapes import LARGEST
-from perception.language.description import InstanceDescription, from_arrays, to_arrays
+from perception.language.description import InstanceDescription, chosen_rows, from_arrays, to_arrays
 from perception.map.files import map_signature, read_info
 from perception.map.history import is_removed, joined_record, past_of
 from perception.map.map import Map, language_in, prefixed
@@ -160,10 +159,8 @@ class Editor:
         if "ids" not in parts:
             return parts
         kept = np.isin(np.unique(parts["ids"][parts["ids"] >= 0]), self._known_parts())
-        language = language_in(parts)
-        if language and not kept.all():
-            descriptions, encoder = from_arrays(language)
-            parts = prefixed(to_arrays(list(itertools.compress(descriptions, kept)), encoder))
+        if not kept.all():
+            parts = prefixed(chosen_rows(language_in(parts), np.flatnonzero(kept).tolist()))
         return {**parts, "ids": self.part_ids.astype(np.int32)}
 
     # ------------------------------------------------------------------ editing

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -67,6 +67,14 @@ def from_arrays(arrays: dict[str, np.ndarray]) -> tuple[list[InstanceDescription
         embeddings = arrays["embeddings"][n], arrays["view_embeddings"][start:end]
         descriptions.append(InstanceDescription(*embeddings, arrays["palettes"][n], names, [tuple(b) for b in boxes]))
     return descriptions, str(arrays["encoder"])
+
+
+def chosen_rows(arrays: dict[str, np.ndarray], rows: Iterable[int]) -> dict[str, np.ndarray]:
+    """The arrays of some rows of `to_arrays`, in this order; {} of {}."""
+    if not arrays:
+        return {}
+    descriptions, encoder = from_arrays(arrays)
+    return to_arrays([descriptions[n] for n in rows], encoder)
 
 
 def check_encoder(stored: str, used: str) -> None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from perception.language.description import from_arrays, to_arrays
+from perception.language.description import chosen_rows
 from perception.map.history import RECORD, is_removed
 from perception.map.map import Map, build_index
 
@@ -24,7 +24,8 @@ def present(gmap: Map) -> dict[str, Any]:
     groups, of = gmap.groups, gmap.groups.get("of")
     if of is not None:  # a group that lost a member is none
         groups = {**groups, "of": of[rows]} if (np.delete(of, rows) < 0).all() else {}
-    return {"instances": [gmap.instances[n] for n in rows], "language": _rows(gmap.language, rows), "groups": groups}
+    language = chosen_rows(gmap.language, rows)
+    return {"instances": [gmap.instances[n] for n in rows], "language": language, "groups": groups}
 
 
 def scene(gmap: Map, spot_of: Callable[[Spot], Spot | None]) -> dict[str, Any]:
@@ -45,13 +46,5 @@ def scene(gmap: Map, spot_of: Callable[[Spot], Spot | None]) -> dict[str, Any]:
         entries.append({**kept, **then, "num_gaussians": len(points[-1])})
     ids = np.repeat([entry["id"] for entry in entries], [entry["num_gaussians"] for entry in entries])
     index = build_index(np.concatenate(points), ids.astype(np.int64))
-    language = _rows(gmap.language, rows)
+    language = chosen_rows(gmap.language, rows)
     return {"instances": entries, "language": language, "parts": {}, "groups": {}, "index": index}
-
-
-def _rows(language: dict[str, np.ndarray], rows: Sequence[int]) -> dict[str, np.ndarray]:
-    """Rows of the arrays of `Map.language`."""
-    if not language:
-        return {}
-    descriptions, encoder = from_arrays(language)
-    return to_arrays([descriptions[n] for n in rows], encoder)

@@ -13,16 +13,15 @@ import torch
 from perception.boxes import instance_entry
 from perception.colors import rgb_from_sh, sh_from_rgb
 from perception.gaussians.model import Gaussians
-from perception.language.description import from_arrays, to_arrays
+from perception.language.description import chosen_rows, from_arrays, to_arrays
 from perception.map.history import is_removed, visits_of
 from perception.map.map import Map, language_in, prefixed
-from perception.photos.decode import open_photo
+from perception.photos.decode import CAMERA_FOLDER, exif_of, open_photo
 from perception.visits.evidence import UNSEEN, Signs, probability
 from perception.visits.motion import Motion
 
 _GEOMETRY = ("num_gaussians", "centroid", "obb", "aabb")
 _TAKEN = 36867  # EXIF DateTimeOriginal
-_EXIF = 0x8769  # the table that holds it
 
 
 def time_taken(photos: Sequence[Path]) -> datetime | None:
@@ -31,7 +30,7 @@ def time_taken(photos: Sequence[Path]) -> datetime | None:
     for photo in photos:
         try:
             with open_photo(photo) as image:
-                times.append(datetime.strptime(image.getexif().get_ifd(_EXIF)[_TAKEN], "%Y:%m:%d %H:%M:%S"))
+                times.append(datetime.strptime(exif_of(image, photo, CAMERA_FOLDER)[_TAKEN], "%Y:%m:%d %H:%M:%S"))
         except (OSError, KeyError, ValueError, TypeError):
             continue
     return max(times, default=None)
@@ -129,12 +128,8 @@ def kept_parts(
     kept = np.array(sorted(part["id"] for entry in instances for part in entry.get("parts", ())), np.int64)
     if len(kept) == 0:
         return {}
-    arrays: dict[str, np.ndarray] = {"ids": np.where(np.isin(ids, kept), ids, -1).astype(np.int32)}
-    if language := language_in(parts):
-        descriptions, encoder = from_arrays(language)
-        chosen = [descriptions[n] for n in np.flatnonzero(np.isin(before, kept))]
-        arrays |= prefixed(to_arrays(chosen, encoder))
-    return arrays
+    language = chosen_rows(language_in(parts), np.flatnonzero(np.isin(before, kept)).tolist())
+    return {"ids": np.where(np.isin(ids, kept), ids, -1).astype(np.int32), **prefixed(language)}
 
 
 def past_with(gmap: Map, gone: Sequence[int], until: int, light: np.ndarray) -> dict[str, np.ndarray]:
