@@ -14,13 +14,13 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.arrays import map_npy, read_npz
 from perception.io.atomic import current
-from perception.io.documents import brief
+from perception.io.documents import brief, refusing
 from perception.io.json_shapes import parsed
 from perception.io.ply import map_ply
 from perception.map.checksums import EDITABLE, FACTS, STORE, check_file, check_sizes, damaged
 from perception.map.history import is_removed
 from perception.map.model import check_archive, check_facts, check_ids, check_instances
-from perception.photos.view_json import views_of_facts
+from perception.photos.view_json import view_from_json
 
 FORMAT_VERSION = 2
 _ARRAYS = {"features": 2, "instance_ids": 1, "membership": 1}
@@ -98,7 +98,8 @@ class MapFiles:
         if name in ("info", "instances"):
             return getattr(self, name)
         if name == "views":
-            return views_of_facts(self.facts, self.path / FACTS)
+            with refusing(f"{self.path / FACTS}: its views cannot be understood ({{why}}); the map is damaged"):
+                return [view_from_json(entry) for entry in self.facts.get("views", [])]
         if name in ARCHIVES:
             file, raw = self.path / f"{name}.npz", self._archives.get(name)
             arrays = {} if raw is None else read_npz(raw, file, "the map is damaged, build it again")

@@ -27,7 +27,7 @@ from perception.io.atomic import atomic_file
 from perception.io.documents import safe_name
 from perception.io.ply import write_ply
 from perception.map.checksums import EDITABLE, FACTS, IGNORED, REPORT, facts_of, listed_files, seal, verify
-from perception.map.files import FORMAT_VERSION, MapFiles
+from perception.map.files import ARCHIVES, FORMAT_VERSION, MapFiles
 from perception.map.map import Map
 from perception.map.replace import map_directory, writing
 from perception.photos.named_files import NamedFiles, folded
@@ -58,11 +58,9 @@ def write_map(path: Path, gmap: Map, keep_report: bool = False, fresh: bool = Fa
         np.save(folder / "features.npy", gmap.features.astype(np.float32))
         np.save(folder / "instance_ids.npy", gmap.instance_ids.astype(np.int32))
         np.save(folder / "membership.npy", gmap.membership.astype(np.float32))
-        if gmap.language:
-            np.savez_compressed(folder / "language.npz", **gmap.language)  # type: ignore[arg-type]
-        for name, arrays in (("parts", gmap.parts), ("groups", gmap.groups), ("past", gmap.past)):
-            if arrays:
-                np.savez_compressed(folder / f"{name}.npz", **arrays)  # type: ignore[arg-type]
+        for name in ARCHIVES:
+            if arrays := getattr(gmap, name):
+                np.savez_compressed(folder / f"{name}.npz", **arrays)
         if still := info.get("scene", {}).get("still"):
             (folder / IGNORED).write_bytes(base64.b64decode(still["mask"]))
         _dump(folder / EDITABLE, {"instances": gmap.instances})

@@ -19,7 +19,6 @@ from pydantic import AfterValidator, Field, Strict
 
 from perception.errors import InputError
 from perception.io.atomic import pointed
-from perception.io.documents import refusing
 from perception.io.json_shapes import (
     Bytes,
     Count,
@@ -175,10 +174,3 @@ def _lens_json(lens: Lens | None) -> list[Any] | None:
 
 def _lens_of(entry: list[Any] | None) -> Lens | None:
     return None if entry is None else Lens(entry[0], tuple(map(float, entry[1])), *entry[2:])
-
-
-def views_of_facts(info: dict[str, Any], file: Path) -> list[StoredView]:
-    """The views that map.json records, `info` being its content and `file` its name for messages.
-    InputError when the record is malformed."""
-    with refusing(f"{file}: its views cannot be understood ({{why}}); the map is damaged"):
-        return [view_from_json(entry) for entry in info.get("views", [])]
