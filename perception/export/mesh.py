@@ -17,7 +17,7 @@ from perception.export.export_map import SURFACE_OPACITY, ExportOptions, export_
 from perception.export.neighbors import nearest_gaussian
 from perception.frame.recentre import map_from_input
 from perception.geometry import camera_centres
-from perception.io.atomic import atomic_file
+from perception.io.atomic import write_file
 from perception.io.cloud import write_cloud
 from perception.io.open3d import fuse_depth, write_glb
 from perception.machine import require_memory
@@ -116,8 +116,7 @@ def export_voxels(gmap: Map, output: Path, voxel: float | None) -> tuple[dict[st
         "frame": np.array(gmap.frame),
         "unit": np.array(_unit(gmap)),
     }
-    with atomic_file(output) as new, new.open("wb") as file:
-        np.savez(file, **arrays)
+    write_file(output, lambda file: np.savez(file, **arrays))
     shares = {name: float((state == value).mean()) for name, value in (("free", FREE), ("occupied", OCCUPIED))}
     facts = {"shape": list(state.shape), "voxel_size": size, "unit": _unit(gmap), **shares}
     text = f"{output}: {' x '.join(map(str, state.shape))} voxels of {size:.4g} {_unit(gmap)}, "

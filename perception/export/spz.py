@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.atomic import atomic_file, write_file
+from perception.io.atomic import write_file
 from perception.map.map import Map
 from perception.splats.spz import COLOR_SCALE, FLIPS, HEADER, MAGIC
 
@@ -31,8 +31,7 @@ def write_spz(path: Path, gmap: Map) -> None:
     colours 1/510. InputError where a value is not finite.
     """
     data = spz_bytes(gmap, path)
-    with atomic_file(path.with_suffix(".npy")) as new, new.open("wb") as file:
-        np.save(file, gmap.instance_ids.astype(np.int32))
+    write_file(path.with_suffix(".npy"), lambda file: np.save(file, gmap.instance_ids.astype(np.int32)))
     write_file(path, data)
 
 

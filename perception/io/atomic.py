@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from glob import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 from uuid import uuid4
 
 from perception.errors import InputError
@@ -48,10 +48,13 @@ def atomic_file(path: str | Path, parents: bool = False) -> Iterator[Path]:
         yield temporary
 
 
-def write_file(path: str | Path, content: str | bytes, parents: bool = False) -> None:
-    """Writes a whole file as `atomic_file` does, a text in UTF-8."""
-    with atomic_file(path, parents) as new:
-        new.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
+def write_file(path: str | Path, content: str | bytes | Callable[[BinaryIO], object], parents: bool = False) -> None:
+    """Writes a whole file as `atomic_file` does: a text in UTF-8, bytes, or what a function writes to the open file."""
+    with atomic_file(path, parents) as new, new.open("wb") as file:
+        if callable(content):
+            content(file)
+        else:
+            file.write(content.encode("utf-8") if isinstance(content, str) else content)
 
 
 @contextmanager

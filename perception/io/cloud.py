@@ -16,7 +16,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.arrays import read_npz
-from perception.io.atomic import atomic_file
+from perception.io.atomic import atomic_file, write_file
 from perception.io.documents import refusing
 from perception.io.ply import MOST_ROWS, Element, Lists, Property, Table, packed, read_body, read_ply, write_ply
 from perception.machine import require_memory
@@ -221,8 +221,7 @@ def _write_npz(path: Path, cloud: PointCloud) -> None:
     parts = {"points": cloud.points, "colors": cloud.colors, "normals": cloud.normals, "faces": cloud.faces}
     arrays = {name: values for name, values in parts.items() if values is not None}
     everything: dict[str, Any] = arrays | cloud.labels
-    with atomic_file(path) as new, new.open("wb") as file:
-        np.savez(file, **everything)
+    write_file(path, lambda file: np.savez(file, **everything))
 
 
 def _read_pcd(path: Path) -> PointCloud:

@@ -26,7 +26,7 @@ import numpy as np
 
 from perception.errors import CLASSIFIER, InputError, packaged_file
 from perception.io.arrays import map_npy
-from perception.io.atomic import atomic_file
+from perception.io.atomic import write_file
 from perception.language import minilm
 from perception.language.base import Part, Reading, check_images, check_texts, unit_rows
 from perception.language.household import CLASSES, class_names, household_thing
@@ -150,6 +150,6 @@ def _cached(names: list[list[str]], encode: Any) -> np.ndarray:
     embedded = encode(flat)
     sizes = np.array([len(group) for group in names])
     classes = unit_rows(np.add.reduceat(embedded, np.cumsum(sizes) - sizes, axis=0) / sizes[:, None])
-    with suppress(InputError), atomic_file(path, parents=True) as aside, aside.open("wb") as file:
-        np.save(file, classes)  # without a writable cache the embeddings are recomputed each time
+    with suppress(InputError):  # without a writable cache the embeddings are recomputed each time
+        write_file(path, lambda file: np.save(file, classes), parents=True)
     return classes

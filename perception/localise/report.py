@@ -11,7 +11,7 @@ from typing import Any
 from perception.errors import InputError
 from perception.inputs.load import input_files
 from perception.inputs.transforms import unit_of
-from perception.io.atomic import atomic_file
+from perception.io.atomic import write_file
 from perception.localise.localiser import Localised, Localiser, NotHere
 from perception.localise.photos import new_photos, transforms_of
 from perception.map.map import Map
@@ -39,8 +39,7 @@ def localise_photos(
     if output is not None and found:
         depths = {photo.name: photo.depth for photo in new}
         head = {"map_id": gmap.map_id, "frame": gmap.frame, **unit_of(gmap.info)}
-        with atomic_file(output) as aside:
-            aside.write_text(json.dumps(transforms_of(found, depths, output, head), indent=1) + "\n", encoding="utf-8")
+        write_file(output, json.dumps(transforms_of(found, depths, output, head), indent=1) + "\n")
     return facts, _lines(answers, gmap, localiser.rendered)
 
 

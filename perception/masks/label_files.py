@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.atomic import atomic_file
+from perception.io.atomic import write_file
 from perception.io.documents import safe_name
 from perception.types import View
 
@@ -45,8 +45,8 @@ def write_labels(file: Path, labels: np.ndarray, key: str = "") -> None:
         raise ValueError(f"{file}: labels must lie in 0..{LARGEST}, found {labels.min()}..{labels.max()}")
     info = PngImagePlugin.PngInfo()
     info.add_text(_KEY, key)
-    with atomic_file(file, parents=True) as aside:
-        Image.fromarray(labels.astype(np.uint16)).save(aside, "PNG", compress_level=4, pnginfo=info)
+    picture = Image.fromarray(labels.astype(np.uint16))
+    write_file(file, lambda new: picture.save(new, "PNG", compress_level=4, pnginfo=info), parents=True)
 
 
 def stored_key(file: Path) -> str | None:

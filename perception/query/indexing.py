@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.atomic import atomic_file, pointed, recover, write_file
+from perception.io.atomic import pointed, recover, write_file
 from perception.language.encoders import make_encoder
 from perception.map.checksums import FACTS, STORE
 from perception.map.replace import writing
@@ -121,9 +121,8 @@ def _indexed(store: Path, gmap: QueryMap, facts: dict[str, Any]) -> dict[str, An
     key = json.dumps([str(path), gmap.map_id, identity, FORMAT_VERSION])
     file = hashlib.sha256(key.encode()).hexdigest()[:32] + ".npz"
     if not (store / "maps" / file).is_file():
-        arrays = _arrays(gmap)
-        with atomic_file(store / "maps" / file, parents=True) as aside, aside.open("wb") as stream:
-            np.savez(stream, **arrays)  # type: ignore[arg-type]
+        arrays: dict[str, Any] = _arrays(gmap)
+        write_file(store / "maps" / file, lambda stream: np.savez(stream, **arrays), parents=True)
     written = datetime.fromtimestamp((path / FACTS).stat().st_mtime, timezone.utc).isoformat(timespec="seconds")
     entry = {"map": str(path), "map_id": gmap.map_id, "frame": gmap.frame, "metric": gmap.metric, "written": written}
     return {**entry, "instances": len(gmap.instances), "file": file}
