@@ -32,7 +32,7 @@ from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.train import Trainer
 from perception.inputs.readers import EXPECTED
-from perception.io.atomic import atomic_file
+from perception.io.atomic import atomic_file, delete
 from perception.io.documents import refusing
 from perception.machine import peak_memory_mib, refuse_full_disk
 from perception.map.replace import writing
@@ -270,9 +270,7 @@ def _remove(work: Path) -> None:
     """Deletes what a run wrote in its work folder, and the folder unless other files lie there."""
     if (work / INPUTS).is_file():
         for file in (file for pattern in OWN for file in work.glob(pattern)):
-            shutil.rmtree(file, ignore_errors=True)
-            with contextlib.suppress(OSError):  # it was a folder
-                file.unlink()
+            delete(file)
     with contextlib.suppress(OSError):  # it holds other files, or is not there
         work.rmdir()
 

@@ -13,7 +13,6 @@ from perception.config import MapConfig
 from perception.errors import InputError
 from perception.frame.recentre import recentred
 from perception.frame.world_frame import in_world_frame, references
-from perception.gaussians.device import choose_device
 from perception.gaussians.photos import held_out_names, split_scene
 from perception.inputs.load import load_scene
 from perception.language.base import Encoder
@@ -64,7 +63,7 @@ def build_map(
     with working(source, output, resume) as work:
         # Files, models and devices are opened first, so that errors appear before hours of work.
         hold_inputs(work, source, config, output)
-        run = _open_run(source, config, work, progress, engine)
+        run = Run.begun(source, config, work, progress, engine)
         masks, encoder, reader = _open_models(run)
         splat = open_splat(source, config)
         references(config.frame)
@@ -97,13 +96,6 @@ def build_map(
 
 
 # ----------------------------------------------------------------------- stages
-
-
-def _open_run(source: Path, config: MapConfig, work: Path, progress: Progress, engine: Engine) -> Run:
-    device, notice = choose_device(config.device)
-    if notice is not None:
-        progress.log(notice)
-    return Run(source, config, work, work / "masks", device, progress, engine)
 
 
 def _open_models(run: Run) -> tuple[MaskSource, Encoder | None, TextReader | None]:

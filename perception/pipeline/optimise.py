@@ -15,6 +15,7 @@ import torch
 
 from perception.config import MapConfig
 from perception.gaussians.depth_start import start_on_surface
+from perception.gaussians.device import choose_device
 from perception.gaussians.model import Gaussians, Nearby, from_points
 from perception.gaussians.photos import load_all, with_labels
 from perception.gaussians.state import TrainRecord, sized
@@ -28,7 +29,7 @@ from perception.photos.decode import load_photo
 from perception.pipeline.checkpoint import TrainingObserver, digest, training_mark
 from perception.pipeline.estimate import image_memory, largest_budget
 from perception.progress import QUIET, Progress, timed
-from perception.tasks.engine import Engine
+from perception.tasks.engine import LOCAL, Engine
 from perception.tasks.folder import has_task, read_task, write_task
 from perception.types import Scene, View
 
@@ -54,6 +55,14 @@ class Run:
     seconds: dict[str, float] = field(default_factory=dict)
     inputs: dict[str, dict[str, str]] = field(default_factory=dict)
     started: float = field(default_factory=time.monotonic)
+
+    @classmethod
+    def begun(cls, source: Path, config: MapConfig, work: Path, progress: Progress, engine: Engine = LOCAL) -> Run:
+        """A run on the device of the settings, which is told."""
+        device, notice = choose_device(config.device)
+        if notice is not None:
+            progress.log(notice)
+        return cls(source, config, work, work / "masks", device, progress, engine)
 
     def __post_init__(self) -> None:
         self._arrays = DiskArrays(self.work, image_memory(self.config, memory_limit()))

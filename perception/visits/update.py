@@ -20,7 +20,6 @@ import numpy as np
 
 from perception.config import MapConfig
 from perception.errors import InputError
-from perception.gaussians.device import choose_device
 from perception.gaussians.model import Nearby
 from perception.instances.group import Grouping
 from perception.language.base import Encoder
@@ -72,10 +71,7 @@ def update_map(
         return made
     with working(source, output, resume) as work:
         hold_inputs(work, source, config, output)
-        device, notice = choose_device(config.device)
-        if notice is not None:
-            progress.log(notice)
-        run = Run(source, config, work, work / "masks", device, progress)
+        run = Run.begun(source, config, work, progress)
         masks = make_source(config.masks, config.sam)
         _refuse_other_masks(gmap, masks.name)
         encoder = _encoder_of(gmap)
