@@ -1,13 +1,16 @@
 """Scores `perception update` over visits of made scenes of several seeds, in a row.
 
 python tools score.made_visits tabletop|room WORK --seeds N ... [--visits N] [--side PX] [--views N]
-    [--share KIND=X ...] [--corner SHARE] [--masks labels|labels_sam|builtin] [--alone] [--apart] [--set KEY=VALUE ...]
+    [--share KIND=X ...] [--corner SHARE] [--masks labels|labels_sam|builtin] [--alone] [--apart] [--back]
+    [--set KEY=VALUE ...]
 
 Makes the visits of `worlds.visits` (400 × 300 pixels, 36 or 56 photos), the map of the first one (1000 iterations,
 without language), and updates it visit after visit. A row for each visit, then mean, spread and range over all of them,
 and what came true of the states, by confidence. Given poses, unless --alone. --share: of the things, by kind of change
 (moved, turned, removed, added, swapped); none=0: only the light changes. --corner: later visits use that share of their
-photos, the first ones by name. --apart: also a new map of every visit, for its PSNR and its CPU seconds.
+photos, the first ones by name. --apart: also a new map of every visit, for its PSNR and its CPU seconds. --back: then a
+visit that finds the place as the first one did; `back` is the share of the things said to be removed that have their
+ids again where they stood.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from perception.config import load_config
-from perception.map.history import changes_of, visits_of
+from perception.map.history import changes_of, is_removed, visits_of
 from perception.map.write import Map, read_map
 from perception.pipeline.mapping import build_map
 from perception.visits.scene import update_settings
@@ -38,7 +41,9 @@ SETTINGS = ("train.iterations=1000", "language.encoder=none", "language.texts=of
 BINS = (0.0, 0.6, 0.8, 0.9, 0.97, 1.0)
 """Of confidence."""
 COLUMNS = ("f1", "false_alarms", "unseen_called_removed", "motion_cm", "nearest_cm", "motion_degrees", "turns_unknown",
-           "ids_kept", "off_cm", "gaussians", "psnr", "new_psnr", "cpu", "new_cpu")  # fmt: skip
+           "ids_kept", "back", "off_cm", "gaussians", "psnr", "new_psnr", "cpu", "new_cpu")  # fmt: skip
+NEAR = 0.05
+"""Metres from where a thing stood within which it is back."""
 T = TypeVar("T")
 
 
@@ -94,9 +99,28 @@ def scored(folder: Path, given: argparse.Namespace) -> list[dict[str, Any]]:
         if given.apart:
             apart, row["new_cpu"] = new_map(visit, folder / f"apart-{given.masks}-{number}.gsmap")
             row["new_psnr"] = apart.info["quality"].get("psnr")
+        if given.back and number == given.visits - 1:
+            row["back"] = came_back(folder, folder / f"map-{given.masks}.gsmap", path, masks)
         rows.append(row)
         show(f"{folder.name}, visit {number}", row)
     return rows
+
+
+def came_back(folder: Path, first: Path, path: Path, masks: Callable[[Path], str]) -> float:
+    """Share of the things that the map at `path` says are removed that stand where they stood, under their ids, after a
+    visit that finds the place as visit 0 did; NaN without any."""
+    again, output = folder / "again", folder / "back.gsmap"
+    for made in (again, output):
+        shutil.rmtree(made, ignore_errors=True)
+    shutil.copytree(folder / "visit0", again, copy_function=shutil.copyfile)  # newer photos
+    truth = Truth.read(folder / "visit0", folder / "visit1")
+    found = owners(read_map(first), truth.points[0], truth.ids[0])[0]
+    things = {instance for thing, instance in found.items() if thing in truth.entries}
+    gone = {e["id"]: e["centroid"] for e in read_map(path).instances if is_removed(e) and e["id"] in things}
+    today = update_map(path, again, output, update_settings(path, None, [masks(again)]))
+    spots = {e["id"]: e["centroid"] for e in today.instances if not is_removed(e)}
+    right = [i in spots and np.linalg.norm(np.subtract(spots[i], spot)) < NEAR for i, spot in gone.items()]
+    return float(np.mean(right)) if right else float("nan")
 
 
 def show(name: str, row: dict[str, Any]) -> None:
@@ -134,7 +158,7 @@ def main() -> None:
     parser.add_argument("--share", nargs="+", default=[])
     parser.add_argument("--corner", type=float, default=1.0)
     parser.add_argument("--masks", choices=("labels", "labels_sam", "builtin"), default="labels")
-    for flag in ("--alone", "--apart"):
+    for flag in ("--alone", "--apart", "--back"):
         parser.add_argument(flag, action="store_true")
     parser.add_argument("--set", action="append", default=[], dest="pairs")
     given = parser.parse_args()
