@@ -162,7 +162,7 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Table]]:
                 case ["format" | "element" | "property", *_]:
                     raise ValueError("too few fields")
         except (KeyError, IndexError, ValueError) as error:
-            raise InputError(f"{path}: PLY header line {' '.join(fields)!r} cannot be understood") from error
+            raise InputError(f"{path}: PLY header line {' '.join(fields)[:80]!r} cannot be understood") from error
     if end is None or order is None:
         raise InputError(f"{path}: PLY header is cut short: no 'format' or no 'end_header' line")
     for table in tables:

@@ -149,6 +149,7 @@ GOOD = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty flo
             b"ply\nformat ascii 1.0\nelement vertex 1\nproperty quad x\nend_header\n",
             "cannot be understood",
         ),
+        ("a.ply", GOOD[:-3] + bytes(3000), "cannot be understood"),  # as a disk leaves it that lost power
         ("a.ply", b"ply\nformat ascii 1.0\n", "cut short"),
         ("a.ply", GOOD + b"end_header\n1 2\n", "cut short"),
         ("a.ply", GOOD + b"end_header\n1 two 3\n", "numbers are expected"),
@@ -183,7 +184,8 @@ def test_bad_files_are_told_in_one_line(tmp_path, name, data, word):
     path.write_bytes(data)
     with pytest.raises(InputError, match=word) as error:
         read_cloud(path)
-    assert str(path) in str(error.value) and "\n" not in str(error.value)
+    told = str(error.value)
+    assert str(path) in told and "\n" not in told and len(told) < len(str(path)) + 600
 
 
 def test_a_file_that_cannot_fit_is_refused_before_it_is_read(tmp_path, monkeypatch):
