@@ -154,10 +154,10 @@ def as_it_was(gmap: Map, entry: dict[str, Any]) -> Gaussians | None:
     """The Gaussians of a removed instance where it stood last, without features; None where past.npz does not hold what
     they looked like."""
     past, last = gmap.past, entry["past"][-1]["until"]
-    rows = (
-        np.flatnonzero((past["ids"] == entry["id"]) & (past["until"] == last)) if "quats" in past else np.zeros(0, int)
-    )
-    if len(rows) == 0 or not past["quats"][rows].any():
+    if "quats" not in past:
+        return None
+    rows = np.flatnonzero((past["ids"] == entry["id"]) & (past["until"] == last))
+    if not past["quats"][rows].any():
         return None
     sh = np.zeros((len(rows), *gmap.sh.shape[1:]), np.float32)
     sh[:, 0] = sh_from_rgb(past["colors"][rows].astype(np.float32))
