@@ -30,21 +30,26 @@ OPACITY = 0.9  # of those placed; training has little time left to strengthen th
 
 @dataclass(frozen=True)
 class _Seen:
-    """A photo as the map shows it. labels [H, W] int; depth [H, W], 0 = none; area [M] and own [M]: pixels and
-    Gaussians of each mask, 0 for label 0; focal length in pixels."""
+    """A photo as the map shows it. labels [H, W] int; depth [H, W] float16, 0 = none, over `unit`, the median; area [M]
+    and own [M]: pixels and Gaussians of each mask, 0 for label 0; focal length in pixels."""
 
     view: TrainingView
     labels: np.ndarray
-    depth: np.ndarray
+    depth: np.ndarray  # of all photos at once, so in half precision: a hundredth of NEAR
+    unit: float
     area: np.ndarray
     own: np.ndarray
     focal: float
+
+    def depth_at(self, pixel: tuple[np.ndarray, ...]) -> np.ndarray:
+        """Depth [P] float32 in scene units of pixels, their rows [P] and columns [P]."""
+        return self.depth[pixel].astype(np.float32) * np.float32(self.unit)
 
     def shown(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Label [P] and depth z [P] of each of points [P, 3]; label 0 where the photo does not show its surface."""
         inside, pixels, z = self.view.seen(points)
         pixel, label = tuple(pixels), np.zeros(len(points), self.labels.dtype)
-        near = np.abs(self.depth[pixel] - z[inside]) < NEAR * z[inside]
+        near = np.abs(self.depth_at(pixel) - z[inside]) < NEAR * z[inside]
         label[inside] = np.where(near, self.labels[pixel], 0)
         return label, z
 
@@ -68,7 +73,7 @@ def for_starved_masks(gaussians: Gaussians, views: list[TrainingView], seed: int
         served = seen[k].own[mask] + (seen[k].shown(points)[0] == mask).sum()
         if served >= OWN or len(pixels) < OWN / 2:
             continue
-        z = seen[k].depth[tuple(pixels.T)]
+        z = seen[k].depth_at(tuple(pixels.T))
         new = unprojected(*seen[k].view.camera, pixels[:, 1] + 0.5, pixels[:, 0] + 0.5, z)
         pixel = float(np.median(z)) / seen[k].focal
         if any(_confirms(other, new, pixel, int(seen[k].area[mask])) for j, other in enumerate(seen) if j != k):
@@ -82,9 +87,11 @@ def _seen(gaussians: Gaussians, means: np.ndarray, widest: np.ndarray, solid: np
     assert view.labels is not None  # checked by the caller
     labels = view.labels.numpy()
     depth = surface_depth(gaussians, replace(view, depth=None))
+    unit = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
+    half = np.minimum(depth / np.float32(unit), np.finfo(np.float16).max).astype(np.float16)
     area = np.bincount(labels.ravel())
     area[0] = 0
-    one = _Seen(view, labels, depth, area, np.zeros(len(area), np.int64), float(view.K[0, 0]))
+    one = _Seen(view, labels, half, unit, area, np.zeros(len(area), np.int64), float(view.K[0, 0]))
     label, z = one.shown(means)
     fits = solid & (widest * one.focal / np.maximum(z, 1e-6) <= WITHIN * np.sqrt(area[label] / np.pi))
     return replace(one, own=np.bincount(label[fits], minlength=len(area)))
@@ -118,7 +125,7 @@ def _made(
     """Balls at points [P, 3], which are those of the pixels in `placed`, as large as their distance there."""
     colors, sizes = [np.zeros((0, 3))], [np.zeros(0)]
     for k, pixels in placed:
-        view, depth = seen[k].view, seen[k].depth[tuple(pixels.T)]
+        view, depth = seen[k].view, seen[k].depth_at(tuple(pixels.T))
         gain = 1.0 if view.gain is None else view.gain.numpy()
         colors.append(view.photo.numpy()[tuple(pixels.T)] / 255 / gain)
         step = np.sqrt(seen[k].area[seen[k].labels[tuple(pixels.T)]] / len(pixels))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -50,6 +52,17 @@ def test_a_mask_that_two_photos_show_gets_gaussians_on_its_surface() -> None:
     assert (born.scales < RADIUS / 2).all()
     rgb = born.sh[:, 0] * 0.28209479 + 0.5
     np.testing.assert_allclose(rgb, np.tile(RED, (len(born), 1)) / np.float32(255), atol=1e-3)
+
+
+def test_units_do_not_matter() -> None:
+    gaussians, views, unit = large(plane()), [view("a", 0.1), view("b", -0.1)], 1e6  # beyond half precision
+    born = for_starved_masks(gaussians, views, 0)
+    for one in views:
+        one.camera_from_world[:3, 3] *= unit
+    scaled = replace(gaussians, means=gaussians.means * unit, log_scales=gaussians.log_scales + float(np.log(unit)))
+    again = for_starved_masks(scaled, views, 0)
+    np.testing.assert_allclose(again.means.numpy() / unit, born.means.numpy(), atol=1e-4)
+    np.testing.assert_allclose(again.log_scales - np.log(unit), born.log_scales, atol=1e-3)
 
 
 def test_a_mask_of_one_photo_or_too_few_pixels_gets_none() -> None:
