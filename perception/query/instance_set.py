@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from dataclasses import replace
 from functools import cache, cached_property, partial
 from typing import Any
 
@@ -12,6 +14,8 @@ from perception.colors import rgb8_from_sh
 from perception.map.history import is_removed, last_seen, since
 from perception.map.map import InstanceIndex, Map, build_index
 from perception.query.hit import Hit
+from perception.query.spatial_index import SpatialIndex
+from perception.query.where import Where, tidy
 from perception.types import OrientedBox
 
 
@@ -29,6 +33,35 @@ class InstanceSet:
     @cached_property
     def index(self) -> InstanceIndex:
         return self._gmap.index if self._ids is None else build_index(self._gmap.means, self._ids)
+
+    @cached_property
+    def spatial(self) -> SpatialIndex:
+        return SpatialIndex(self.index)
+
+    def fulfils(self, row: int, where: Where) -> bool:
+        """Whether entry `row` fulfils `where`, which is in the map's frame."""
+        number, box = int(self.entries[row]["id"]), self._box(row)
+        longest = max(box.extent)
+        if not self.has_label(row, where.labels):
+            return False
+        if where.min_size is not None and longest < where.min_size:
+            return False
+        if where.max_size is not None and longest > where.max_size:
+            return False
+        if where.region is not None and self.spatial.share_inside(number, where.region) < where.share:
+            return False
+        return where.within is None or self.spatial.distance(number, np.asarray(where.near)) <= where.within
+
+    def has_label(self, row: int, labels: Collection[str] | None) -> bool:
+        """Whether entry `row` has one of these labels, which are tidy; None: any or none."""
+        return labels is None or tidy(self.entries[row].get("label") or "") in labels
+
+    def measured(self, row: int, where: Where, score: float | None = None) -> Hit:
+        """As `hit`, with its distance if `where.near` is given."""
+        hit = self.hit(row, score)
+        if where.near is None:
+            return hit
+        return replace(hit, distance=self.spatial.distance(int(self.entries[row]["id"]), np.asarray(where.near)))
 
     def hit(self, row: int, score: float | None = None) -> Hit:
         """Entry `row` as a Hit; score: the mapper's confidence when None."""

@@ -16,6 +16,7 @@ from perception.query.hit import Hit
 from perception.query.instance_set import InstanceSet
 from perception.query.ranking import PRESENT, Ranker, evidence_of
 from perception.query.relations import parse
+from perception.query.where import Where
 
 CLEAR = 1.2  # least difference of `evidence_of` to every instance that shares points with the part or the group
 
@@ -31,9 +32,9 @@ class Node:
     rows: list[int]
     instances: tuple[int, ...]
 
-    def hit(self, score: float) -> Hit:
-        """As a Hit of its instance, or of its first member."""
-        hit = self.kind.hit(self.row, score)
+    def hit(self, score: float, where: Where) -> Hit:
+        """As a Hit of its instance, or of its first member, with its distance if `where.near` is given."""
+        hit = self.kind.measured(self.row, where, score)
         part = hit.instance_id if self.is_part else None
         return replace(hit, instance_id=self.instances[0], part=part, instances=() if self.is_part else self.instances)
 
@@ -43,10 +44,10 @@ Candidate = tuple[int | Node, float]
 
 
 class Nodes:
-    """The parts and groups of a map that have embeddings. ranker: returns that of the map's instances."""
+    """The parts and groups of a map that have embeddings. wholes, ranker: the map's instances, and returns theirs."""
 
-    def __init__(self, gmap: Map, ranker: Callable[[], Ranker]) -> None:
-        self._gmap, self._ranker_of_instances = gmap, ranker
+    def __init__(self, gmap: Map, wholes: InstanceSet, ranker: Callable[[], Ranker]) -> None:
+        self._gmap, self._wholes, self._ranker_of_instances = gmap, wholes, ranker
         row_of = {entry["id"]: n for n, entry in enumerate(gmap.instances)}
         self._kinds: list[InstanceSet] = []
         self._nodes: list[Node] = []
@@ -73,10 +74,11 @@ class Nodes:
         groups = [from_arrays(language)[0] for language in (self._gmap.language, *(k.language for k in self._kinds))]
         return self._ranker_of_instances().over([description for group in groups for description in group])
 
-    def fitting(self, text: str, hits: list[tuple[int, float]]) -> list[Candidate]:
+    def fitting(self, text: str, hits: list[tuple[int, float]], where: Where) -> list[Candidate]:
         """`hits` of all instances, best first, with the nodes that fit clearly better instead of the instances that
         they share points with; parts only if the encoder knows more than whole objects. Labels of the user and texts on
-        shapes, relations and prints are left alone."""
+        shapes, relations and prints are left alone. Only nodes that fulfil `where`, with the labels of their instances,
+        which is in the map's frame."""
         special = shape_kind(text) or parse(text) or quoted_text(text)
         if not self._nodes or special or hits[0][1] == 1.0:
             return list(hits)
@@ -87,7 +89,12 @@ class Nodes:
         for n, node in enumerate(self._nodes, start=count):
             if node.is_part and wholes:
                 continue
-            if score[n] >= PRESENT and z[n] >= CLEAR + max(z[i] for i in node.rows):
+            clear = score[n] >= PRESENT and z[n] >= CLEAR + max(z[i] for i in node.rows)
+            if clear and self._fulfils(node, where):
                 chosen.append((node, score[n]))
                 replaced.update(node.rows)
         return sorted([*chosen, *(hit for hit in hits if hit[0] not in replaced)], key=lambda hit: -hit[1])
+
+    def _fulfils(self, node: Node, where: Where) -> bool:
+        labelled = all(self._wholes.has_label(n, where.labels) for n in node.rows)
+        return labelled and node.kind.fulfils(node.row, replace(where, labels=None))

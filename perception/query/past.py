@@ -9,7 +9,7 @@ import numpy as np
 
 from perception.language.description import chosen_rows
 from perception.map.history import RECORD, is_removed
-from perception.map.map import Map, build_index
+from perception.map.map import Map, build_index, language_in, prefixed
 
 Spot = dict[str, Any]
 """An entry of instances.json, or one of its `past`."""
@@ -21,11 +21,20 @@ _NOT_THEN = {*_THEN, "parts", *(key.rstrip("?") for key in RECORD)}
 def present(gmap: Map) -> dict[str, Any]:
     """The fields of `gmap` that the removed instances are part of, without them."""
     rows = [n for n, entry in enumerate(gmap.instances) if not is_removed(entry)]
-    groups, of = gmap.groups, gmap.groups.get("of")
-    if of is not None:  # a group that lost a member is none
-        groups = {**groups, "of": of[rows]} if (np.delete(of, rows) < 0).all() else {}
     language = chosen_rows(gmap.language, rows)
-    return {"instances": [gmap.instances[n] for n in rows], "language": language, "groups": groups}
+    return {"instances": [gmap.instances[n] for n in rows], "language": language, "groups": _whole(gmap.groups, rows)}
+
+
+def _whole(groups: dict[str, np.ndarray], rows: list[int]) -> dict[str, np.ndarray]:
+    """The groups of which all members are among `rows` of the instances, which are those that are left."""
+    if not groups:
+        return {}
+    of, lost = groups["of"][rows], np.delete(groups["of"], rows)
+    kept = np.setdiff1d(of[of >= 0], lost)
+    number = np.full(len(groups["scores"]) + 1, -1, np.int32)  # its last entry is that of −1
+    number[kept] = np.arange(len(kept))
+    language = prefixed(chosen_rows(language_in(groups), kept))
+    return {"of": number[of], "scores": groups["scores"][kept], **language} if len(kept) else {}
 
 
 def scene(gmap: Map, spot_of: Callable[[Spot], Spot | None]) -> dict[str, Any]:

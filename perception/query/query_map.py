@@ -31,7 +31,6 @@ from perception.query.where import (
     check_frame,
     check_length,
     position_of,
-    tidy,
     wanted_in_map,
 )
 from perception.types import DepthImage, Lens, OrientedBox, View
@@ -128,22 +127,17 @@ class QueryMap(Map):
         if not self.instances:
             return []
         ranked, wanted = self._ranking.rank(text).hits, wanted_in_map(where, frame)
-        chosen: list[Candidate] = list(ranked)
-        if where is not None:
-            allowed = set(self._fulfilling(wanted))
-            chosen = [(n, score) for n, score in ranked if n in allowed]
-        elif min_score is None:
-            chosen = self._nodes.fitting(text, ranked)
-        hits = [
-            candidate.hit(score) if isinstance(candidate, Node) else self._measured(candidate, wanted, score)
-            for candidate, score in answering(chosen, min_score)[:top_k]
-        ]
+        allowed = set(range(len(self.instances)) if where is None else self._fulfilling(wanted))
+        found = self._nodes.fitting(text, ranked, wanted) if min_score is None else ranked
+        chosen: list[Candidate] = [pair for pair in found if isinstance(pair[0], Node) or pair[0] in allowed]
+        answers, whole = answering(chosen, min_score)[:top_k], self._wholes.measured
+        hits = (c.hit(score, wanted) if isinstance(c, Node) else whole(c, wanted, score) for c, score in answers)
         return [_in(frame, hit) for hit in hits]
 
     def find(self, where: Where | None = None, *, frame: Frame | None = None) -> list[Hit]:
         """All instances that fulfil `where`, in the order of instances.json, scored by the mapper's confidence."""
         wanted = wanted_in_map(where, frame)
-        return [_in(frame, self._measured(n, wanted)) for n in self._fulfilling(wanted)]
+        return [_in(frame, self._wholes.measured(n, wanted)) for n in self._fulfilling(wanted)]
 
     def in_box(self, box: OrientedBox, *, share: float = 0.5, frame: Frame | None = None) -> list[Hit]:
         """The instances with at least `share` of their points in `box` (`axis_box`: a box along the axes)."""
@@ -322,27 +316,7 @@ class QueryMap(Map):
 
     def _fulfilling(self, where: Where) -> list[int]:
         """Indices in instances.json of the instances that fulfil `where`, which is in the map's frame."""
-        return [n for n in range(len(self.instances)) if self._fulfils(n, where)]
-
-    def _fulfils(self, position: int, where: Where) -> bool:
-        entry = self.instances[position]
-        if where.labels is not None and tidy(entry.get("label") or "") not in where.labels:
-            return False
-        longest = max(entry["obb"]["extent"])
-        if where.min_size is not None and longest < where.min_size:
-            return False
-        if where.max_size is not None and longest > where.max_size:
-            return False
-        if where.region is not None and self._spatial.share_inside(entry["id"], where.region) < where.share:
-            return False
-        return where.within is None or self._spatial.distance(entry["id"], np.asarray(where.near)) <= where.within
-
-    def _measured(self, position: int, where: Where, score: float | None = None) -> Hit:
-        """A Hit, with its distance if `where.near` is given."""
-        hit = self.hit(position, score)
-        if where.near is None:
-            return hit
-        return replace(hit, distance=self._spatial.distance(hit.instance_id, np.asarray(where.near)))
+        return [n for n in range(len(self.instances)) if self._wholes.fulfils(n, where)]
 
     def _colors(self, position: int) -> tuple[tuple[str, float], ...]:
         """Names of the instance's colours and their shares, from 5 % up, largest first."""
@@ -372,7 +346,7 @@ class QueryMap(Map):
 
     @cached_property
     def _nodes(self) -> Nodes:
-        return Nodes(self, lambda: self.ranker)
+        return Nodes(self, self._wholes, lambda: self.ranker)
 
     @cached_property
     def free_space(self) -> FreeSpace:
@@ -383,7 +357,7 @@ class QueryMap(Map):
 
     @cached_property
     def _spatial(self) -> SpatialIndex:
-        return SpatialIndex(self.index)
+        return self._wholes.spatial
 
 
 def _in(frame: Frame | None, hit: Hit) -> Hit:

@@ -14,8 +14,9 @@ from perception.language.base import Reading
 from perception.language.colors import PALETTE
 from perception.language.description import InstanceDescription, to_arrays
 from perception.map.write import read_map, write_map
-from perception.query import QueryMap, load_map
+from perception.query import QueryMap, Where, axis_box, load_map
 from support.query_maps import HashEncoder, encoders, write_map_of
+from support.visited_map import NAMES, number, write_visited_map
 
 
 def said(*names: str) -> dict[str, np.ndarray]:
@@ -57,6 +58,42 @@ def test_a_prompt_is_answered_by_the_node_that_it_names(gmap: QueryMap) -> None:
     np.testing.assert_array_equal(np.sort(both.points, axis=0), np.sort(members, axis=0))
     assert "part" not in mug.to_json() and "instances" not in mug.to_json()
     assert {hit.instance_id for hit in gmap.query("handle", min_score=0.0)} == set(range(3, 12))  # instances alone
+
+
+def test_a_filter_applies_to_nodes_by_their_own_points_and_the_labels_of_their_instances(gmap: QueryMap) -> None:
+    handle, breakfast = gmap.query("handle")[0], gmap.query("breakfast")[0]
+    for text, hit in (("handle", handle), ("breakfast", breakfast)):
+        low, high = hit.points.min(axis=0), hit.points.max(axis=0)
+        around = Where(region=axis_box(low, high), share=1.0)
+        (found,) = gmap.query(text, where=around)
+        assert (found.part, found.instances) == (hit.part, hit.instances)
+        elsewhere = Where(region=axis_box(high + 100, high + 101))
+        assert gmap.query(text, where=elsewhere) == []
+        above = high + np.array([0, 0, 0.5])
+        (found,) = gmap.query(text, where=Where(near=above, within=5.0))
+        assert found.distance == pytest.approx(np.linalg.norm(hit.points - above, axis=1).min())
+        smaller = gmap.query(text, where=Where(max_size=0.99 * max(hit.obb.extent)))
+        assert all((other.part, other.instances) != (hit.part, hit.instances) for other in smaller)
+    assert gmap.query("handle", where=Where(labels=["mug"])) == []  # its mug has no label
+    gmap.instances[0]["label"] = "Mug"
+    try:
+        assert gmap.query("handle", where=Where(labels=["mug"]))[0].part == 20
+    finally:
+        del gmap.instances[0]["label"]
+
+
+def test_only_groups_whose_members_all_stand_today_answer(tmp_path: Path) -> None:
+    """The mug is gone, and with it the breakfast; the tea set is there."""
+    gmap = read_map(write_visited_map(tmp_path / "m.gsmap"))
+    of = {"mug": 0, "banana": 0, "lamp": 1, "kettle": 1}
+    ids = np.array([of.get(name, -1) for name in NAMES], np.int32)
+    gmap.groups = {"of": ids, "scores": np.array([0.5, 0.6], np.float32), **said("breakfast", "tea set")}
+    write_map(tmp_path / "m.gsmap", gmap)
+    opened = load_map(tmp_path / "m.gsmap", encoders)
+    (tea,) = opened.query("tea set")
+    assert tea.instances == (number("lamp"), number("kettle"))
+    assert all(not hit.instances for hit in opened.query("breakfast", min_score=0.0))
+    assert not any(hit.instances for hit in opened.query("breakfast"))
 
 
 def test_parts_do_not_answer_where_the_encoder_knows_whole_objects(path: Path) -> None:
