@@ -27,6 +27,7 @@ from perception.localise.reference import Locate, Reference, open_reference
 from perception.map.map import Map
 from perception.photos.decode import CAMERA_FOLDER, exif_of, open_photo, photo_size, why_left_out
 from perception.photos.lens import camera_from_lens, rescale_lens, same_aspect
+from perception.photos.still import with_still
 from perception.photos.view_json import locate_photo
 from perception.photos.views import make_view, view_lens
 from perception.progress import QUIET, Progress
@@ -48,19 +49,21 @@ OTHER_UNIT = 1.5
 
 @dataclass(frozen=True)
 class NewPhoto:
-    """A photo to be localised. lens: None if not known. depth: scale in the map's unit."""
+    """A photo to be localised. lens: None if not known. depth: scale in the map's unit. mask: of pixels to ignore (see
+    `ignore_masks`)."""
 
     name: str
     photo: Path
     lens: Lens | None = None
     depth: DepthImage | None = None
+    mask: Path | None = None
 
 
 @dataclass(frozen=True)
 class Localised:
     """A photo's pose: camera_from_map [4, 4] float64, OpenCV axes, in the map's frame and unit. lens: known, or as
     estimated. covariance [6, 6]: of the rotation vector about the map's axes (radians), then of the position. inliers:
-    features that agree with the pose; rms_px: their error in pixels."""
+    features that agree with the pose; rms_px: their error in pixels. mask: of the pixels that were used."""
 
     name: str
     photo: Path
@@ -69,6 +72,7 @@ class Localised:
     covariance: np.ndarray
     inliers: int
     rms_px: float
+    mask: Path | None = None
 
     @property
     def position(self) -> np.ndarray:
@@ -122,15 +126,23 @@ class Localiser:
             why_left_out(photo, strict=True)
         lenses = [lens] * len(photos) if lens is None or isinstance(lens, Lens) else lens
         each = zip(photos, lenses, depths or [None] * len(photos), strict=True)
-        found = self.answers([NewPhoto(photo.name, photo, own, depth) for photo, own, depth in each])
-        return [answer if isinstance(answer, Localised) else None for answer in found]
+        new = [NewPhoto(photo.name, photo, own, depth) for photo, own, depth in each]
+        with TemporaryDirectory(prefix="perception-localise-") as still:
+            found = self.answers(new, Path(still))
+        return [replace(answer, mask=None) if isinstance(answer, Localised) else None for answer in found]
 
-    def answers(self, photos: Sequence[NewPhoto]) -> list[Localised | NotHere]:
-        """As `localise`, with the reason for each photo that has no pose; one that cannot be read is among these."""
+    def answers(self, photos: Sequence[NewPhoto], still: Path | None = None) -> list[Localised | NotHere]:
+        """As `localise`, with the reason for each photo that has no pose; one that cannot be read is among these.
+        still: a folder for masks of what stays in the picture while the camera moves; None uses it as all else."""
         unread = {n: why for n, p in enumerate(photos) if (why := why_left_out(p.photo)) is not None}
         usable = [n for n in range(len(photos)) if n not in unread]
+        chosen = [photos[n] for n in usable]
+        paths, own = [photo.photo for photo in chosen], [photo.mask for photo in chosen]
+        masked = with_still(paths, list(map(photo_size, paths)), own, still, self._progress)
+        for note in masked.added_to({}).get("notes", []):
+            self._progress.log(note)
+        chosen = [replace(photo, mask=mask) for photo, mask in zip(chosen, masked.masks, strict=True)]
         with TemporaryDirectory(prefix="perception-localise-") as folder:
-            chosen = [photos[n] for n in usable]
             found = _Search(self._reference, chosen, Path(folder), self._progress).run() if usable else []
         done = dict(zip(usable, found, strict=True))
         return [done[n] if n in done else NotHere(p.name, p.photo, unread[n]) for n, p in enumerate(photos)]
@@ -143,7 +155,7 @@ class _Search:
         self.reference, self.photos, self.progress = reference, photos, progress
         lenses, self.trust = zip(*(_lens_of(photo, reference.views) for photo in photos), strict=True)
         paths, options = [photo.photo for photo in photos], ReadOptions(folder, progress=progress)
-        self.store = build_features(paths, list(lenses), options)
+        self.store = build_features(paths, list(lenses), options, [photo.mask for photo in photos])
         self._see(lenses)
         self.most = tolerance(max(max(view.photo_size) for view in self.views))
         self.placed: dict[int, np.ndarray] = {}
@@ -269,11 +281,12 @@ class _Search:
             return NotHere(photo.name, photo.photo, f"not in this map: {self.why[number]}")
         lens, pose = view_lens(self.views[number]), self.placed[number]
         figures = found.covariance[number], found.inliers[number], found.rms[number]
-        return Localised(photo.name, photo.photo, lens, pose, *figures)
+        return Localised(photo.name, photo.photo, lens, pose, *figures, photo.mask)
 
 
 def _view(photo: NewPhoto, lens: Lens) -> View:
-    return replace(make_view(photo.name, photo.photo, lens, np.eye(4), photo.photo), depth=photo.depth)
+    view = make_view(photo.name, photo.photo, lens, np.eye(4), photo.photo)
+    return replace(view, depth=photo.depth, mask=photo.mask)
 
 
 def _lens_of(photo: NewPhoto, views: list[View]) -> tuple[Lens, float]:

@@ -32,7 +32,8 @@ def localise_photos(
     listed = [file for source in sources if source.is_dir() for file in input_files(source)]
     refuse_inputs([output], [path, camera, *sources, *listed, *(photo.photo for photo in new)])
     localiser = Localiser(gmap, photos, show)
-    answers = localiser.answers(new)
+    with TemporaryDirectory(prefix="perception-localise-") as still:
+        answers = localiser.answers(new, Path(still))
     facts = {"photos": [answer_json(answer) for answer in answers], "frame": gmap.frame, "metric": gmap.metric}
     facts |= {"map_id": gmap.map_id, "rendered": localiser.rendered}
     found = [answer for answer in answers if isinstance(answer, Localised)]

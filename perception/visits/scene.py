@@ -69,6 +69,7 @@ def visit_scene(run: Run, gmap: Map, output: Path) -> Scene:
     photos, source = run.config.photos, run.source
     camera, masks = (Path(file) if file else None for file in (photos.camera, photos.ignore_masks))
     options = ReadOptions(run.work / "sfm", run.config.seed, run.progress, photos.strict, masks, camera)
+    options = replace(options, still=photos.ignore_still)
     b_from_a = map_from_input(gmap.path, gmap.info)
     some = move_points(np.linalg.inv(b_from_a), gmap.means[:: max(1, len(gmap) // POINTS)].astype(np.float64))
     cloud = some, np.zeros((len(some), 3), np.uint8)
@@ -78,7 +79,7 @@ def visit_scene(run: Run, gmap: Map, output: Path) -> Scene:
         if source.suffix.lower() in VIDEO_SUFFIXES and source.is_file():
             photos_of = frames_folder(output)
             video_frames(source, photos_of, run.progress)
-        return with_checked_masks(_localised(run, gmap, photos_of, camera, masks), masks)
+        return with_checked_masks(_localised(run, gmap, photos_of, options), masks)
     scene = load_scene(source, options)
     if not scene.views:
         raise InputError(f"{source}: holds no posed photo; give photos of a new visit")
@@ -88,14 +89,15 @@ def visit_scene(run: Run, gmap: Map, output: Path) -> Scene:
     return replace(scene, views=[moved(view, b_from_a) for view in scene.views])
 
 
-def _localised(run: Run, gmap: Map, source: Path, camera: Path | None, masks: Path | None) -> Scene:
-    found = new_photos([source], camera, run.work / "sfm", run.progress)
+def _localised(run: Run, gmap: Map, source: Path, options: ReadOptions) -> Scene:
+    found = new_photos([source], options.camera, options.workdir, run.progress)
+    found = [replace(photo, mask=mask_of(options.masks, photo.name)) for photo in found]
     for photo in found if run.config.photos.strict else ():
         why_left_out(photo.photo, strict=True)
     localiser = Localiser(gmap, progress=run.progress)
     if localiser.rendered:
         run.progress.log(rendered_notice(gmap, localiser.rendered))
-    answers = localiser.answers(found)
+    answers = localiser.answers(found, options.still_folder([photo.mask for photo in found]))
     here = [answer for answer in answers if isinstance(answer, Localised)]
     if len(here) < LEAST_SHARE * len(answers):
         lost = next(answer for answer in answers if not isinstance(answer, Localised))
@@ -104,7 +106,7 @@ def _localised(run: Run, gmap: Map, source: Path, camera: Path | None, masks: Pa
         raise InputError(f"{run.source}: {many}; give photos of the mapped scene, or map this one anew")
     views = [make_view(a.name, a.photo, a.lens, a.camera_from_map, a.photo) for a in here]
     depths = {photo.name: photo.depth for photo in found}
-    views = [replace(view, depth=depths[view.name], mask=mask_of(masks, view.name)) for view in views]
+    views = [replace(v, depth=depths[v.name], mask=answer.mask) for v, answer in zip(views, here, strict=True)]
     left = [{"name": a.name, "why": a.why} for a in answers if not isinstance(a, Localised)]
     report = {"input": "photos", "left_out": left}
     none = np.zeros((0, 3))

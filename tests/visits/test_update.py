@@ -183,10 +183,16 @@ def test_a_killed_update_goes_on_to_the_same_map(world: Path, new: Map) -> None:
     assert all(one[name] == other[name] for name in one if name != "map.json")
 
 
-def test_photos_alone_are_localised(world: Path, new: Map) -> None:
-    """Beside a damaged photo and one that its mask ignores, in a map of photos that lie in a folder visit1."""
+def test_photos_alone_are_localised(world: Path, new: Map, capsys: pytest.CaptureFixture[str]) -> None:
+    """Beside a damaged photo and one that its mask ignores, in a map of photos that lie in a folder visit1. A part of
+    the robot stays in the lower corner of all pictures."""
     photos, masks, old = world / "photos", world / "ignore", read_map(world / "old.gsmap")
-    shutil.copytree(world / "visit1" / "images", photos)
+    part = cv2.GaussianBlur(np.random.default_rng(9).integers(10, 250, (40, 50, 3)).astype(np.uint8), (0, 0), 1.0)
+    photos.mkdir()
+    for photo in sorted((world / "visit1" / "images").iterdir()):
+        picture = cv2.imread(str(photo))
+        picture[-40:, :50] = part
+        cv2.imwrite(str(photos / photo.name), picture, [cv2.IMWRITE_JPEG_QUALITY, 97])
     (photos / "broken.jpg").write_bytes(b"no picture")
     masks.mkdir()
     cv2.imwrite(str(masks / "003.png"), np.zeros((150, 200), np.uint8))
@@ -195,6 +201,7 @@ def test_photos_alone_are_localised(world: Path, new: Map) -> None:
     write_map(world / "named.gsmap", old)
     words = command(world, photos, "localised.gsmap")
     assert main(["update", str(world / "named.gsmap"), *words[2:], "--ignore-masks", str(masks)]) == 0
+    assert "what stays in the picture while the camera moves is ignored" in capsys.readouterr().err
     gmap = read_map(world / "localised.gsmap")
     assert len({view.name for view in gmap.views}) == len(gmap.views) > len(old.views)
     left_out = {Path(entry["name"]).name for entry in gmap.info["scene"]["left_out"]}
@@ -205,6 +212,8 @@ def test_photos_alone_are_localised(world: Path, new: Map) -> None:
     size = np.ptp(old.means, axis=0).max()
     shifts = [np.linalg.norm(np.linalg.inv(poses[n])[:3, 3] - np.linalg.inv(given[n])[:3, 3]) for n in poses]
     assert np.median(shifts) < 0.01 * size
+    counts = [[entry["state"] for entry in each.instances].count("added") for each in (gmap, new)]
+    assert counts[0] == counts[1]  # the part is none
 
 
 def test_bad_visits_are_refused_in_one_line(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
