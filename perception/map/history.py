@@ -55,8 +55,8 @@ RECORD = {
 
 @dataclass(frozen=True)
 class Visit:
-    """number: 0 is the making of the map. time: UTC, "2026-11-25T19:41:58Z", None where it is not known. input: path of
-    what was recorded. photos: how many."""
+    """number: 0 is the making of the map. time: UTC, "2026-11-25T19:41:58Z", None where it is not known; by the clock
+    of a camera that does not state its offset. input: path of what was recorded. photos: how many."""
 
     number: int
     time: str | None

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
-from datetime import datetime, timezone
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
@@ -21,24 +22,30 @@ from perception.visits.evidence import UNSEEN, Signs, probability
 from perception.visits.motion import Motion
 
 _GEOMETRY = ("num_gaussians", "centroid", "obb", "aabb")
-_TAKEN = 36867  # EXIF DateTimeOriginal
+_TAKEN, _OFFSET = 36867, 36881  # EXIF DateTimeOriginal and OffsetTimeOriginal
 
 
-def time_taken(photos: Sequence[Path]) -> datetime | None:
-    """When the newest of the photos was taken, by EXIF, which knows no time zone; None where none says so."""
+def time_taken(photos: Sequence[Path], utc: bool = False) -> datetime | None:
+    """When the newest of the photos was taken, by EXIF; None where none says so. By the camera's clock; `utc`: in UTC
+    where EXIF states the offset of that clock."""
     times = []
     for photo in photos:
         try:
             with open_photo(photo) as image:
-                times.append(datetime.strptime(exif_of(image, photo, CAMERA_FOLDER)[_TAKEN], "%Y:%m:%d %H:%M:%S"))
-        except (OSError, KeyError, ValueError, TypeError):
+                exif = exif_of(image, photo, CAMERA_FOLDER)
+            time = datetime.strptime(exif[_TAKEN], "%Y:%m:%d %H:%M:%S")
+            offset = re.fullmatch(r"([+-])(\d\d):(\d\d)", str(exif.get(_OFFSET))) if utc else None
+            sign, hours, minutes = offset.groups() if offset else ("+", 0, 0)
+            times.append(time - int(f"{sign}1") * timedelta(hours=int(hours), minutes=int(minutes)))
+        except (OSError, KeyError, ValueError, TypeError, OverflowError):
             continue
     return max(times, default=None)
 
 
 def visit_record(source: Path, photos: Sequence[Path]) -> dict[str, Any]:
-    """An entry of `visits` of map.json. time: when the newest photo was taken, else when its file was written."""
-    taken = time_taken(photos)
+    """An entry of `visits` of map.json. time: when the newest photo was taken, else when its file was written; in
+    UTC, or by the clock of a camera that does not state its offset."""
+    taken = time_taken(photos, utc=True)
     if taken is None and photos:
         taken = datetime.fromtimestamp(max(photo.stat().st_mtime for photo in photos), timezone.utc)
     time = None if taken is None else taken.strftime("%Y-%m-%dT%H:%M:%SZ")

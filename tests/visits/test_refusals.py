@@ -18,18 +18,19 @@ from perception.map.write import read_map, set_labels, write_map
 from perception.pipeline.changes import inputs_of
 from perception.pipeline.checkpoint import digest, fingerprint
 from perception.visits.look import Look
+from perception.visits.record import visit_record
 from perception.visits.scene import foreign_photos, refuse_older, update_settings
 from perception.visits.update import update_map
 from support.visited_map import number, write_visited_map
 
-TAKEN = 0x9003  # EXIF DateTimeOriginal
+TAKEN, OFFSET = 0x9003, 0x9011  # EXIF DateTimeOriginal and OffsetTimeOriginal
 
 
-def photo(path: Path, time: str | None) -> SimpleNamespace:
-    """A view of visit 0, of a photo that was taken at a time by EXIF."""
+def photo(path: Path, time: str | None, offset: str | None = None) -> SimpleNamespace:
+    """A view of visit 0, of a photo that was taken at a time by EXIF, by a clock of this offset."""
     exif = Image.Exif()
-    if time is not None:
-        exif.get_ifd(0x8769)[TAKEN] = time
+    stated = {TAKEN: time, OFFSET: offset}
+    exif.get_ifd(0x8769).update({tag: text for tag, text in stated.items() if text is not None})
     Image.new("RGB", (8, 8)).save(path, exif=exif)
     return SimpleNamespace(photo=path, visit=0)
 
@@ -52,6 +53,18 @@ def test_photos_older_than_the_map_are_refused_by_their_exif(tmp_path: Path) -> 
     unknown[0].visit = 1
     with pytest.raises(InputError, match="older than the map"):
         refuse_older(a_map([*old, *unknown]), before)
+
+
+@pytest.mark.parametrize(
+    ("offset", "time"),
+    [("+02:00", "2026-11-23T23:30:00Z"), ("-05:30", "2026-11-24T07:00:00Z"), (None, "2026-11-24T01:30:00Z")]
+    + [(text, "2026-11-24T01:30:00Z") for text in ("   :  ", "Z", "+2", "")],
+)
+def test_the_time_of_a_visit_is_utc_where_the_camera_states_its_offset(
+    tmp_path: Path, offset: str | None, time: str
+) -> None:
+    view = photo(tmp_path / "a.jpg", "2026:11:24 01:30:00", offset)
+    assert visit_record(tmp_path, [view.photo])["time"] == time
 
 
 def test_depth_in_another_unit_is_refused(tmp_path: Path) -> None:
