@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from perception.colors import rgb_from_sh
 from perception.gaussians.model import Gaussians
 from perception.gaussians.photos import split_scene
 from perception.gaussians.views import TrainingView
@@ -35,6 +36,8 @@ from perception.visits.record import as_it_was
 from perception.visits.registration import compact
 from perception.visits.scene import foreign_photos, refuse_older, visit_scene
 
+GREY = 2.0
+"""Mean difference of a pixel's channels, in grey levels, below which a photo has no colours."""
 TENSORS = ("means", "quats", "log_scales", "opacity_logits", "sh", "features")
 """Of `Gaussians`, and fields of a map."""
 
@@ -116,6 +119,9 @@ def open_visit(run: Run, gmap: Map, source: MaskSource, output: Path) -> Visit:
     photos = Photos.load(run, training, held_out)
     rows = np.flatnonzero(in_view(gmap.means, gmap.scales.max(axis=1), [*photos.views, *photos.held]))
     old, ids = gaussians_of(gmap, rows), gmap.instance_ids[rows]
+    if one_is_grey(old, photos.views):
+        both = "the photos are grey and the map is not, or the map is: what moved may be told as removed and added"
+        run.progress.log(f"warning: {run.source}: {both}; give photos like those of the map")
     with run.stage("look"):
         photos, light = _exposed(old, photos)
         lit = in_light(old, light)
@@ -134,6 +140,13 @@ def open_visit(run: Run, gmap: Map, source: MaskSource, output: Path) -> Visit:
     number = len(gmap.info.get("visits") or [0])
     mark = digest(gmap.map_id, training_mark(run.source, run.config), source.identity)
     return Visit(run, gmap, number, rows, lit, light, photos, stereo, masks, mark, left_out)
+
+
+def one_is_grey(old: Gaussians, views: Sequence[TrainingView]) -> bool:
+    """Whether the photos have no colours and the Gaussians do, or the other way round."""
+    photos = all(float(np.ptp(view.photo.numpy(), axis=2).mean()) < GREY for view in views)
+    mapped = 255 * float(np.ptp(rgb_from_sh(old.sh[:, 0].numpy()), axis=1).mean())
+    return len(old) > 0 and photos != (mapped < GREY)
 
 
 def _told(run: Run, left_out: Sequence[dict[str, str]]) -> list[dict[str, str]]:
