@@ -38,6 +38,8 @@ LEAST_MAPPED, LEAST_ALIKE = 0.2, 0.35
 """A photo shows the map where that covers at least this share of it, with at least this correlation of brightness."""
 LEAST_SHARE = 0.8
 """Share of the photos that must show the map; a few that do not are left out."""
+SAME = 0.02
+"""Turn in radians and shift over the median depth, in sum, up to which two photos were taken from one place."""
 OF_INPUT = ("photos.camera", "photos.ignore_masks", "photos.init_points", "photos.held_out", "frame.", "device")
 """Settings, or groups of them, that belong to the input of a map and not to those of its visits."""
 OF_MAP = ("photos.init_points", "photos.poses", "frame.", "splat.")
@@ -64,7 +66,34 @@ def update_settings(path: Path, file: Path | None, pairs: list[str]) -> MapConfi
 
 
 def visit_scene(run: Run, gmap: Map, output: Path) -> Scene:
-    """The views of the visit, in the map's frame. InputError where there are none, or most are of another scene."""
+    """The views of the visit, in the map's frame, one of each place: a robot that stands still takes many, and what one
+    shows by mistake all do. InputError where there are none, or most are of another scene."""
+    scene = _all_views(run, gmap, output)
+    points = gmap.means[:: max(1, len(gmap) // POINTS)].astype(np.float64)
+    views = without_doubles(scene.views, points)
+    if len(views) == len(scene.views):
+        return scene
+    note = f"{len(views)} of {len(scene.views)} photos are used, as the others were taken where one of these was"
+    return replace(scene, views=views, report={**scene.report, "notes": [*scene.report.get("notes", []), note]})
+
+
+def without_doubles(views: Sequence[View], points: np.ndarray) -> list[View]:
+    """The views but those from the place of an earlier one. points [P, 3]: of the scene."""
+    kept: list[View] = []
+    poses = np.zeros((0, 4, 4))
+    for view in views:
+        pose = view.camera_from_world
+        seen = move_points(pose, points)
+        z = seen[(seen[:, 2] > 0) & (np.abs(seen[:, 0]) < seen[:, 2]), 2]
+        depth = float(np.median(z)) if len(z) else np.inf
+        between = pose @ np.linalg.inv(poses)
+        turns = np.arccos(np.clip((np.trace(between[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1))
+        if (turns + np.linalg.norm(between[:, :3, 3], axis=1) / depth > SAME).all():
+            kept, poses = [*kept, view], np.concatenate([poses, pose[None]])
+    return kept
+
+
+def _all_views(run: Run, gmap: Map, output: Path) -> Scene:
     assert gmap.path is not None
     photos, source = run.config.photos, run.source
     camera, masks = (Path(file) if file else None for file in (photos.camera, photos.ignore_masks))
