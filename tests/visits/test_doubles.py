@@ -33,7 +33,9 @@ def test_cameras_that_stood_still_count_once() -> None:
     assert without_doubles([*ring, *still, *others], POINTS) == [*ring, *others]
     assert without_doubles([ring[0]] * 5, POINTS) == [ring[0]]
     assert without_doubles([], POINTS) == []
-    millimetres = [SimpleNamespace(camera_from_world=one.camera_from_world.copy()) for one in (*ring, *still, *others)]
+    millimetres: list[Any] = [
+        SimpleNamespace(camera_from_world=one.camera_from_world.copy()) for one in (*ring, *still, *others)
+    ]
     for one in millimetres:
         one.camera_from_world[:3, 3] *= 1000
     assert len(without_doubles(millimetres, 1000 * POINTS)) == len(ring) + len(others)
