@@ -90,9 +90,10 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
                 shutil.rmtree(aside / "depth", ignore_errors=True)
                 source_of_depth = f"left out: {error}"
             known, fixed = _camera_poses(poses, stamps, frame, options.fixed_frame)
-            measured_down = None if fixed is None else gravity(bag, poses, fixed)
-            down, down_error = (None, None) if measured_down is None else (measured_down[0].tolist(), measured_down[1])
-            vertical = {"gravity": down, "gravity_std_deg": down_error}
+            down = None if fixed is None else gravity(bag, poses, fixed, frame)
+            vertical: dict[str, Any] = {"gravity": None, "gravity_std_deg": None}
+            if down is not None:
+                vertical = {"gravity": down.direction.tolist(), "gravity_std_deg": down.standard_error}
             if fixed is not None:
                 data = {**_transforms(known, stamps, lens, depth), "world_frame": fixed, **(vertical if down else {})}
                 (aside / "transforms.json").write_text(json.dumps(data, indent=1), encoding="utf-8")
@@ -110,6 +111,7 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
         "with_depth": len(depth),
         "left_out": bag.lines(),
         **vertical,
+        "gravity_source": None if down is None else down.source,
     }
     return facts, _text(facts)
 
@@ -184,7 +186,7 @@ def _text(facts: dict[str, Any]) -> str:
     if facts["depth"]:
         line += f"\ndepth: {facts['depth']}"
     if facts["gravity"]:
-        line += f"\ngravity: from the IMU, ±{facts['gravity_std_deg']:.1f}°"
+        line += f"\ngravity: {facts['gravity_source']}, ±{facts['gravity_std_deg']:.1f}°"
     if facts["with_pose"]:
         return f"{line}\nnext: perception map {folder} -o MAP"
     return f"{line}\nno poses\nnext: perception map {folder}/images --camera {folder}/camera.yaml -o MAP"

@@ -1,7 +1,8 @@
-"""Camera poses from a bag's transforms (tf, tf_static) and odometry; gravity in their world, from accelerometers."""
+"""Camera poses from a bag's transforms (tf, tf_static) and odometry; gravity in their world."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,8 @@ STILL_TURN, STILL_PUSH = 0.5, 0.5
 LEAST_SAMPLES, MOST_SAMPLES, BLOCKS = 20, 400, 8
 BIAS_DEG = 0.6
 """Standard error in degrees that averaging does not reduce: a bias of 0.1 m/s² of the accelerometer."""
+BASES, CONVENTION_DEG = ("base_link", "base_footprint"), 2.0
+"""Frames of a mobile robot, under which its odometry is by REP 105: z up, as level as the floor it drives on."""
 
 
 class Poses:
@@ -107,8 +110,30 @@ def _matrix(position: Any, quaternion: Any) -> np.ndarray | None:
     return transform(Rotation.from_quat(xyzw if any(xyzw) else [0, 0, 0, 1]).as_matrix(), xyz)
 
 
-def gravity(bag: Bag, poses: Poses, fixed: str) -> tuple[np.ndarray, float] | None:
-    """Unit vector [3] that points down in frame `fixed`, and its standard error in degrees; None without an IMU.
+@dataclass(frozen=True)
+class Down:
+    """direction: unit vector [3] that points down; its standard error in degrees; source: in words."""
+
+    direction: np.ndarray
+    standard_error: float
+    source: str
+
+
+def gravity(bag: Bag, poses: Poses, fixed: str, frame: str) -> Down | None:
+    """Gravity in the world `fixed` of the camera `frame`: by accelerometers, else by convention if the camera is a
+    mobile robot's; None where neither tells."""
+    measured = _by_accelerometers(bag, poses, fixed)
+    if measured is not None:
+        return measured
+    path = poses.path(frame)
+    robot = any(name.rsplit("/", 1)[-1] in BASES for name in path[: path.index(fixed.lstrip("/"))])
+    if fixed.lstrip("/") not in FIXED_FRAMES or not robot:
+        return None
+    return Down(np.array([0.0, 0.0, -1.0]), CONVENTION_DEG, f"z of '{fixed}' is up (REP 105)")
+
+
+def _by_accelerometers(bag: Bag, poses: Poses, fixed: str) -> Down | None:
+    """As `gravity`; None without an IMU.
 
     An accelerometer at rest measures the acceleration that holds it up. Samples taken while moving slowly are rotated
     into the world by tf and averaged; the error is the spread of the means of BLOCKS stretches of time, and BIAS_DEG.
@@ -132,4 +157,5 @@ def gravity(bag: Bag, poses: Poses, fixed: str) -> tuple[np.ndarray, float] | No
     means = np.array([np.mean(block, axis=0) for block in np.array_split(np.array(ups), BLOCKS)])
     up = means.mean(axis=0)
     spread = np.degrees(np.linalg.norm(means - up, axis=1))
-    return -up / np.linalg.norm(up), float(np.sqrt((spread**2).sum() / (BLOCKS * (BLOCKS - 1)) + BIAS_DEG**2))
+    error = float(np.sqrt((spread**2).sum() / (BLOCKS * (BLOCKS - 1)) + BIAS_DEG**2))
+    return Down(-up / np.linalg.norm(up), error, "from the IMU")

@@ -102,7 +102,8 @@ def _unit(scene: Scene, options: FrameConfig, posed: bool, seed: int) -> tuple[b
 
 
 def _gravity(scene: Scene, seed: int) -> tuple[Gravity | None, list[str]]:
-    """The input's gravity or that of the scene, whichever is more certain, and notes."""
+    """The input's gravity or that of the scene, whichever is more certain, and notes. The scene's sign is that of the
+    cameras, which robots also mount upside down, so the input's is taken where both are opposite."""
     measured = _measured_points(scene.views)
     points = measured if len(measured) else _real_points(scene)
     found = gravity_of_scene(np.stack([view.camera_from_world for view in scene.views]), points, seed)
@@ -115,7 +116,7 @@ def _gravity(scene: Scene, seed: int) -> tuple[Gravity | None, list[str]]:
     notes = []
     if angle > 3 * np.hypot(given.standard_error, found.standard_error) + 2:
         notes.append(f"the input's gravity and that of the scene ({found.source}) differ by {angle:.0f}°")
-    return given if given.standard_error <= found.standard_error else found, notes
+    return given if given.standard_error <= found.standard_error or angle > 90 else found, notes
 
 
 def _measured_points(views: Sequence[View]) -> np.ndarray:

@@ -44,25 +44,25 @@ BASE_FROM_CAM, CAM_FROM_DEPTH = (
 BASE_FROM_IMU = rigid([0.2, 1.0, -0.4], [0.0, 0.1, 0.0])
 
 
-def record(path: Path, kind: str, how: str, late: int = 4_000_000) -> None:
+def record(path: Path, kind: str, how: str, late: int = 4_000_000, base: str = "base", imu: bool = True) -> None:
     """The wall seen by the moving base: photos, depth as `how` says `late` ns after each, tf, camera_info, IMU."""
     rng, bag = np.random.default_rng(0), Recorder(path, kind)
     moved = how == "own frame"
-    bag.transform("/tf_static", START, "base", "cam", BASE_FROM_CAM)
+    bag.transform("/tf_static", START, base, "cam", BASE_FROM_CAM)
     bag.transform("/tf_static", START, "cam", "depth_cam", CAM_FROM_DEPTH)
-    bag.transform("/tf_static", START, "base", "imu", BASE_FROM_IMU)
+    bag.transform("/tf_static", START, base, "imu", BASE_FROM_IMU)
     half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # ROS has pixel centres at whole numbers
     bag.info("/color/camera_info", START, SIZE, COLOR - half, [0.0] * 5)
     bag.info("/depth/camera_info", START, SIZE, (OWN if moved else COLOR) - half, [0.0] * 5)
     for index in range(FRAMES):
         time = START + index * STEP_NS
         there = pose(index)
-        bag.transform("/tf", time, "map", "base", there @ inverse_se3(BASE_FROM_CAM))
+        bag.transform("/tf", time, "map", base, there @ inverse_se3(BASE_FROM_CAM))
         bag.image("/color/image_raw", time, picture(wall_depth(COLOR, there, *SIZE)[1]))
         depth = wall_depth(OWN, there @ CAM_FROM_DEPTH, *SIZE)[0] if moved else wall_depth(COLOR, there, *SIZE)[0]
         depth[:5] = 0
         write(bag, how, time + late, depth)
-    for step in range(10 * (FRAMES - 1)):
+    for step in range(10 * (FRAMES - 1) if imu else 0):
         time = START + step * STEP_NS // 10
         imu_from_world = inverse_se3(pose(step / 10) @ inverse_se3(BASE_FROM_CAM) @ BASE_FROM_IMU)
         force = imu_from_world[:3, :3] @ (-9.81 * DOWN) + rng.normal(0, 0.1, 3)
@@ -113,6 +113,15 @@ def test_photos_depth_poses_and_gravity_come_back(kind: str, how: str, tmp_path:
     assert data["depth_unit_scale_factor"] == 1e-3
     wrong = np.degrees(np.arccos(np.clip(DOWN @ data["gravity"], -1, 1)))
     assert wrong < 2 * data["gravity_std_deg"] < 2.5  # noise of 0.1 m/s² in 36 samples is 0.1°
+
+
+@pytest.mark.parametrize(("base", "known"), [("base_link", True), ("spot/base_link", True), ("rig", False)])
+def test_the_world_of_a_mobile_robot_without_an_imu_has_z_up(base: str, known: bool, tmp_path: Path) -> None:
+    record(tmp_path / "drive", "mcap", "metres", base=base, imu=False)
+    facts, text = run_frames(tmp_path / "drive", tmp_path / "out", FrameOptions(spacing=1e-3))
+    data = json.loads((tmp_path / "out" / "transforms.json").read_text())
+    assert data.get("gravity") == facts["gravity"] == ([0, 0, -1] if known else None)
+    assert ("z of 'map' is up (REP 105), ±2.0°" in text) == known
 
 
 def test_depth_of_another_camera_is_registered_to_the_photos(tmp_path: Path) -> None:

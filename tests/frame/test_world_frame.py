@@ -135,3 +135,13 @@ def test_a_length_that_cannot_be_used_is_refused() -> None:
             in_world_frame(scene, FrameConfig(known_length=text))
     with pytest.raises(InputError, match="board: found 'charuco', expected KIND:COLSxROWS:SQUARE"):
         in_world_frame(scene, FrameConfig(board="charuco"))
+
+
+def test_cameras_that_hang_upside_down_are_told_by_the_inputs_gravity() -> None:
+    scene, _ = room("colmap")
+    true = in_world_frame(scene, FrameConfig()).report["gravity"]["direction"]
+    turned = [replace(v, camera_from_world=np.diag([-1.0, -1, 1, 1]) @ v.camera_from_world) for v in scene.views]
+    given = {"direction": true, "source": "robot", "standard_error_deg": 5.0}
+    hanging = replace(scene, views=turned, report={**scene.report, "gravity": given})
+    found = in_world_frame(hanging, FrameConfig())
+    assert found.report["gravity"] == given and "differ by 180°" in found.report["warnings"][-1]
