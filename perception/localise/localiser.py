@@ -189,11 +189,11 @@ class _Search:
         return [self._answer(number, found) for number in range(len(self.photos))]
 
     def _share_lenses(self, candidates: dict[int, np.ndarray]) -> None:
-        """Photos with one assumed lens were taken by one camera: all get the estimate of median focal length."""
+        """Photos with one assumed lens were taken by one camera: all get the median of the estimates."""
         shared, lenses = dict[Lens, list[Lens]](), [view_lens(view) for view in self.views]
         for number in sorted(number for number in self.placed if self.trust[number] != KNOWN):
             shared.setdefault(lenses[number], []).append(self.lenses[number])
-        chosen = {lens: sorted(found, key=lambda each: each.params)[len(found) // 2] for lens, found in shared.items()}
+        chosen = {lens: _median(found) for lens, found in shared.items()}
         if all(lens == found for lens, found in chosen.items()):
             return
         known = [trust == KNOWN for trust in self.trust]
@@ -305,6 +305,15 @@ def _lens_of(photo: NewPhoto, views: list[View]) -> tuple[Lens, float]:
                 return lens, LIKELY
     focal = USUAL_FOCAL * max(width, height) if stated is None else stated
     return Lens("SIMPLE_RADIAL", (focal, width / 2, height / 2, 0.0), width, height), GUESSED
+
+
+def _median(lenses: Sequence[Lens]) -> Lens:
+    """The medians of the parameters of those that have the most frequent model, of several the first by name."""
+    models = Counter(sorted(lens.model for lens in lenses))
+    model = models.most_common(1)[0][0]
+    rows = [lens.params for lens in lenses if lens.model == model]
+    middle = np.sort(np.array(rows, np.float64), axis=0)[len(rows) // 2]
+    return replace(lenses[0], model=model, params=tuple(middle.tolist()))
 
 
 def _exif_focal(photo: Path, long_side: int) -> float | None:

@@ -23,16 +23,20 @@ features that the first does not, as the other way round: equal textures in two 
 SAME_ANGLE, SAME_SHARE = 3.0, 0.05
 """Poses are the same if they differ by less than this angle in degrees and this share of the distance to the points."""
 KNOWN, LIKELY, GUESSED = np.inf, 1.15, 1.0
-"""How far a lens is trusted: an estimated one replaces it if that makes this many times as many features agree."""
+CLOSELY = 0.25
+"""How far a lens is trusted: an estimated one replaces it if that makes this many times as many features agree closely,
+within this share of the tolerance: a distortion that is left out moves most features by less than the tolerance."""
 
 
 @dataclass(frozen=True)
 class Pose:
-    """camera_from_map [4, 4]; inliers [M]: mask of the matches that agree; count: features among them; lens."""
+    """camera_from_map [4, 4]; inliers [M]: mask of the matches that agree; count: features among them; close: those
+    that agree closely; lens."""
 
     camera_from_map: np.ndarray
     inliers: np.ndarray
     count: int
+    close: int
     lens: Lens
 
 
@@ -75,9 +79,20 @@ def find_pose(matched: Matched, lens: Lens, trust: float, doubt: Callable[[Pose]
 
 def _ransac(matched: Matched, used: np.ndarray, lens: Lens, trust: float) -> Pose | None:
     """The pose that most of the `used` matches agree with, refined by them; None if none is found."""
-    fixed = _estimated(matched, used, lens, free=False)
-    free = None if trust == KNOWN else _estimated(matched, used, lens, free=True)
-    return free if free is not None and (fixed is None or free.count >= trust * fixed.count) else fixed
+    best = _estimated(matched, used, lens, free=False)
+    for model in [] if trust == KNOWN else dict.fromkeys((lens, _with_distortion(lens))):
+        free = _estimated(matched, used, model, free=True)
+        better = best is None or free is None or (free.close >= trust * best.close and free.count >= best.count / trust)
+        best = free if free is not None and better else best
+    return best
+
+
+def _with_distortion(lens: Lens) -> Lens:
+    """A pinhole as a lens with radial distortion, which is 0."""
+    if lens.model not in ("PINHOLE", "SIMPLE_PINHOLE"):
+        return lens
+    focal, centre = float(np.mean(lens.params[:-2])), lens.params[-2:]
+    return Lens("SIMPLE_RADIAL", (focal, *centre, 0.0), lens.width, lens.height)
 
 
 def _estimated(matched: Matched, used: np.ndarray, lens: Lens, free: bool) -> Pose | None:
@@ -95,8 +110,10 @@ def _estimated(matched: Matched, used: np.ndarray, lens: Lens, free: bool) -> Po
     pose = np.vstack([found["cam_from_world"].matrix(), [0, 0, 0, 1]])
     x = matched.point @ pose[:3, :3].T + pose[:3, 3]
     projected = np.asarray(camera.img_from_cam(x), np.float64).reshape(-1, 2)
-    good = (x[:, 2] > 0) & (np.linalg.norm(projected - matched.pixel, axis=1) <= most)
-    return Pose(pose, good, len(np.unique(matched.feature[good])), lens_from_camera(camera))
+    errors = np.where(x[:, 2] > 0, np.linalg.norm(projected - matched.pixel, axis=1), np.inf)
+    good = errors <= most
+    count, close = (len(np.unique(matched.feature[errors <= limit])) for limit in (most, CLOSELY * most))
+    return Pose(pose, good, count, close, lens_from_camera(camera))
 
 
 def _spread(pixel: np.ndarray, lens: Lens) -> float:

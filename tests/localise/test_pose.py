@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from perception.localise.pose import GUESSED, KNOWN, MIN_INLIERS, Matched, Pose, find_pose
+from perception.localise.localiser import _median
+from perception.localise.pose import GUESSED, KNOWN, LIKELY, MIN_INLIERS, Matched, Pose, find_pose
 from perception.types import Lens
 from support.painted_room import difference, pose_at
 
@@ -92,3 +95,24 @@ def test_a_guessed_lens_is_estimated(focal: float) -> None:
     assert isinstance(found, Pose)
     assert found.lens.params[0] == pytest.approx(focal, rel=0.02)
     assert difference(found.camera_from_map, POSE)[0] < 0.1
+
+
+@pytest.mark.parametrize("k", [-0.4, -0.25, 0.0])
+def test_a_pinhole_is_replaced_where_the_photo_is_distorted(k: float) -> None:
+    """As raw photos are of a camera whose undistorted ones the map was made from."""
+    made = matches((POSE, 150), noise=0.5)
+    middle = np.array(LENS.params[2:])
+    normal = (made.pixel - middle) / LENS.params[0]
+    bent = normal * (1 + k * (normal**2).sum(axis=1, keepdims=True))
+    found = find_pose(replace(made, pixel=bent * LENS.params[0] + middle), LENS, LIKELY, sure)
+    assert isinstance(found, Pose) and difference(found.camera_from_map, POSE)[0] < 0.02
+    if k == 0:
+        assert found.lens == LENS
+    else:
+        assert found.lens.model == "SIMPLE_RADIAL" and abs(found.lens.params[-1] - k) < 0.03
+
+
+def test_photos_of_one_camera_get_the_median_of_their_lenses() -> None:
+    bent = [Lens("SIMPLE_RADIAL", (500.0 + n, 320.0, 240.0, k), 640, 480) for n, k in enumerate((-0.2, 0.3, -0.1))]
+    assert _median([LENS, *bent]) == Lens("SIMPLE_RADIAL", (501.0, 320.0, 240.0, -0.1), 640, 480)
+    assert _median([LENS, *bent, LENS, LENS]) == LENS
