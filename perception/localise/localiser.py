@@ -50,13 +50,14 @@ OTHER_UNIT = 1.5
 @dataclass(frozen=True)
 class NewPhoto:
     """A photo to be localised. lens: None if not known. depth: scale in the map's unit. mask: of pixels to ignore (see
-    `ignore_masks`)."""
+    `ignore_masks`). as_stored: its EXIF rotation is not applied."""
 
     name: str
     photo: Path
     lens: Lens | None = None
     depth: DepthImage | None = None
     mask: Path | None = None
+    as_stored: bool = False
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,9 @@ class Localiser:
         usable = [n for n in range(len(photos)) if n not in unread]
         chosen = [photos[n] for n in usable]
         paths, own = [photo.photo for photo in chosen], [photo.mask for photo in chosen]
-        masked = with_still(paths, list(map(photo_size, paths)), own, still, self._progress)
+        stored = [photo.as_stored for photo in chosen]
+        sizes = [photo_size(photo.photo, photo.as_stored) for photo in chosen]
+        masked = with_still(paths, sizes, own, still, self._progress, stored)
         for note in masked.added_to({}).get("notes", []):
             self._progress.log(note)
         chosen = [replace(photo, mask=mask) for photo, mask in zip(chosen, masked.masks, strict=True)]
@@ -155,7 +158,8 @@ class _Search:
         self.reference, self.photos, self.progress = reference, photos, progress
         lenses, self.trust = zip(*(_lens_of(photo, reference.views) for photo in photos), strict=True)
         paths, options = [photo.photo for photo in photos], ReadOptions(folder, progress=progress)
-        self.store = build_features(paths, list(lenses), options, [photo.mask for photo in photos])
+        masks, stored = [photo.mask for photo in photos], [photo.as_stored for photo in photos]
+        self.store = build_features(paths, list(lenses), options, masks, as_stored=stored)
         self._see(lenses)
         self.most = tolerance(max(max(view.photo_size) for view in self.views))
         self.placed: dict[int, np.ndarray] = {}
@@ -286,7 +290,7 @@ class _Search:
 
 def _view(photo: NewPhoto, lens: Lens) -> View:
     view = make_view(photo.name, photo.photo, lens, np.eye(4), photo.photo)
-    return replace(view, depth=photo.depth, mask=photo.mask)
+    return replace(view, depth=photo.depth, mask=photo.mask, as_stored=photo.as_stored)
 
 
 def _lens_of(photo: NewPhoto, views: list[View]) -> tuple[Lens, float]:

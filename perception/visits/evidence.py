@@ -29,6 +29,9 @@ BLURRED = 0.35, 0.55
 thing is gone, as the map is too blurred, and from the second it counts in full. The far floor of 14 made tabletops has
 .24 to .35. Of 79 things that are gone or moved there, four have less than .55; the other signs still tell these."""
 
+FEW = 500
+"""Pixels of all photos by which signs count half: things of made scenes that are gone have 690 and more."""
+
 SAME_OUTLINE = 6.0
 """Further log-odds per unit of the outlines' IoU for a thing at a new spot, where another thing may stand."""
 
@@ -45,7 +48,7 @@ class Signs:
     """What a visit shows of one thing. pixels: that look at it, in photos; share: of its surface that was seen, in
     [0, 1]; correlation, outline (IoU with a mask), colour (difference), through and hit (shares of measured rays that
     end behind it and at it); NaN where nothing was measured. contrast: variance of brightness in the map over that in
-    the photos; measured: share of its pixels whose ray was measured."""
+    the photos; measured: share of its pixels whose ray was measured; score: the mapper's, that it is a thing at all."""
 
     photos: int
     pixels: int
@@ -57,14 +60,16 @@ class Signs:
     hit: float
     contrast: float
     measured: float
+    score: float = 1.0
 
     @property
     def log_odds(self) -> float:
-        """Of the thing standing where it stood, positive for yes: `alike`, but for what a blurred map and rays that
-        were not measured cannot say."""
+        """Of the thing standing where it stood, positive for yes: `alike`, but for what a blurred map, rays that were
+        not measured, the outline of what is hardly a thing, and few pixels cannot say."""
         told, sharp = self._told, float(sharpness(np.array(self.contrast)))
-        against = min(0.0, told["correlation"])
-        return sum(told.values()) - (1 - sharp) * against - (1 - self.measured) * told["through"]
+        against, other_outline = min(0.0, told["correlation"]), min(0.0, told["outline"])
+        unknown = (1 - sharp) * against + (1 - self.measured) * told["through"] + (1 - self.score) * other_outline
+        return (sum(told.values()) - unknown) * self.pixels / (self.pixels + FEW)
 
     @property
     def alike(self) -> float:

@@ -32,6 +32,7 @@ from perception.visits.look import (
     stereo_of,
     with_exposure,
 )
+from perception.visits.placing import checked_poses
 from perception.visits.record import as_it_was
 from perception.visits.registration import compact
 from perception.visits.scene import foreign_photos, refuse_older, visit_scene
@@ -117,6 +118,9 @@ def open_visit(run: Run, gmap: Map, source: MaskSource, output: Path) -> Visit:
         run.progress.log(note)
     scene, training, held_out = split_scene(scene, run.config.photos)
     photos = Photos.load(run, training, held_out)
+    if scene.report.get("input") != "photos":
+        with run.stage("poses"):
+            photos = checked_poses(run, gmap, photos)
     rows = np.flatnonzero(in_view(gmap.means, gmap.scales.max(axis=1), [*photos.views, *photos.held]))
     old, ids = gaussians_of(gmap, rows), gmap.instance_ids[rows]
     if one_is_grey(old, photos.views):

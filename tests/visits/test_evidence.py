@@ -34,7 +34,7 @@ def shown(measured: float, *, same: bool = True, cover: int = 0) -> Look:
 
 def test_a_thing_that_stands_there_a_thing_that_is_gone_and_a_hidden_one() -> None:
     still, gone = (
-        signs_of([look], [7], np.ones(1), np.array([0.1]))[0] for look in (shown(2.0), shown(3.0, same=False))
+        signs_of([look] * 5, [7], np.ones(1), np.array([0.1]))[0] for look in (shown(2.0), shown(3.0, same=False))
     )
     assert still.hit == 1 and still.through == 0 and still.outline == 1 and still.correlation == pytest.approx(0.9)
     assert gone.through == 1 and gone.hit == 0 and gone.correlation == pytest.approx(0.1)
@@ -50,14 +50,27 @@ def test_a_blurred_map_and_rays_that_were_not_measured_say_little_against_a_thin
     sharp = replace(shown(2.0, same=False), measured=behind)
     blurred = replace(sharp, rendered=sharp.rendered / 5, product=sharp.product / np.sqrt(5))
     plain = replace(sharp, **dict.fromkeys(("rendered", "shown", "product"), np.zeros(SHAPE)))
-    seen, unclear, nothing = (signs_of([look], [7], np.ones(1), np.array([0.1]))[0] for look in (sharp, blurred, plain))
+    looks = (sharp, blurred, plain)
+    seen, unclear, nothing = (signs_of([look] * 5, [7], np.ones(1), np.array([0.1]))[0] for look in looks)
     assert seen.correlation == pytest.approx(0.1) and unclear.correlation == pytest.approx(0.1)
     assert seen.contrast == pytest.approx(1) and unclear.contrast == pytest.approx(0.2)
     assert seen.measured == 1 / 20 and seen.through == 1
     assert seen.log_odds < -3 and unclear.log_odds > 0 and nothing.log_odds > 0
     assert unclear.alike == pytest.approx(seen.alike)
     told = 3 * (1 - 0.6) - 8 * (unclear.colour - 0.12) - 2 * (1 - 0.2) / 20  # by hand, of WEIGHTS
-    assert unclear.log_odds == pytest.approx(told)
+    assert unclear.log_odds == pytest.approx(
+        told * 3000 / 3500
+    )  # of 5 photos with 600 pixels each, where 500 count half
+
+
+def test_few_pixels_and_the_outline_of_what_is_hardly_a_thing_say_little() -> None:
+    gone = signs_of([shown(3.0, same=False)] * 5, [7], np.ones(1), np.array([0.1]))[0]
+    assert replace(gone, pixels=44).log_odds > 0.1 * gone.log_odds
+    other = replace(gone, outline=0.0, through=0.0, correlation=0.52, colour=0.12)
+    odds = [replace(other, score=score).log_odds for score in (1.0, 0.5, 0.0)]
+    assert odds[0] == pytest.approx(3 * (0 - 0.6) * 3000 / 3500 + odds[2]) and odds[0] < odds[1] < odds[2]
+    agrees = replace(other, outline=1.0)
+    assert replace(agrees, score=0.1).log_odds == agrees.log_odds
 
 
 def test_what_stands_in_front_is_not_looked_at() -> None:

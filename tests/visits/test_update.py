@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from perception.cli import main
 from perception.config import load_config
@@ -216,6 +217,29 @@ def test_photos_alone_are_localised(world: Path, new: Map, capsys: pytest.Captur
     assert counts[0] == counts[1]  # the part is none
 
 
+def test_poses_that_are_off_are_found_in_the_map(world: Path, new: Map, capsys: pytest.CaptureFixture[str]) -> None:
+    """As a robot's, which drift: by 3 % of the table's width and 2° about other axes from photo to photo."""
+    off, rng = world / "off", np.random.default_rng(0)
+    shutil.copytree(world / "visit1", off)
+    placed = json.loads((off / "transforms.json").read_text())
+    for n, frame in enumerate(placed["frames"]):
+        drift = np.eye(4)
+        drift[:3, :3] = Rotation.from_rotvec(np.radians([2 * np.cos(n / 3), 2 * np.sin(n / 3), 1])).as_matrix()
+        drift[:3, 3] = 0.03 * np.array([np.sin(n / 5), np.cos(n / 5), 0.3]) + rng.normal(0, 0.002, 3)
+        frame["transform_matrix"] = (drift @ np.array(frame["transform_matrix"])).tolist()
+    (off / "transforms.json").write_text(json.dumps(placed))
+    assert main(command(world, off, "off.gsmap")) == 0
+    assert "the given poses do not fit the map" in capsys.readouterr().err
+    gmap = read_map(world / "off.gsmap")
+    states, true = ({e["id"]: e["state"] for e in each.instances} for each in (gmap, new))
+    assert [i for i in true if true[i] != "added" and states.get(i) != true[i]] == []
+    poses, given = ({v.name: v.camera_from_world for v in each.views if v.visit == 1} for each in (gmap, new))
+    shifts = [np.linalg.norm(np.linalg.inv(poses[n])[:3, 3] - np.linalg.inv(given[n])[:3, 3]) for n in given]
+    assert np.median(shifts) < 0.005
+    assert main([*command(world, off, "kept.gsmap"), "--set", "photos.poses=keep"]) in (0, 2)
+    assert "the given poses do not fit the map" not in capsys.readouterr().err
+
+
 def test_bad_visits_are_refused_in_one_line(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before, second = content(world / "old.gsmap"), world / "visit1"
     empty, unit, nothing = tmp_path / "empty", tmp_path / "unit", tmp_path / "nothing"
@@ -231,7 +255,8 @@ def test_bad_visits_are_refused_in_one_line(world: Path, tmp_path: Path, capsys:
         frame["transform_matrix"] = matrix.tolist()
     (unit / "transforms.json").write_text(json.dumps(placed))
     for source, what in ((empty, "no"), (nothing, "no"), (unit / "transforms.json", "unit"), (tmp_path / "x", "no")):
-        assert main(command(world, source, "no.gsmap")) == 2
+        keep = ["--set", "photos.poses=keep"] if what == "unit" else []  # else its photos are localised
+        assert main([*command(world, source, "no.gsmap"), *keep]) == 2
         err = capsys.readouterr().err.strip().splitlines()
         assert what in err[-1] and str(source) in err[-1], err
         assert not (world / "no.gsmap").exists()
