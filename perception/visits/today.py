@@ -42,8 +42,8 @@ from perception.visits.visit import Visit, gaussians_of
 UP = (0.0, 0.0, 1.0)
 """Of a map that does not record gravity."""
 GONE = -0.5
-"""Log-odds of standing where it stood below which a thing does not. Of 109 things of made scenes that went none lies
-between this and 0, but floors and walls of which little was measured do."""
+"""Log-odds of standing where it stood, times the score, below which a thing does not. Of 126 things of made scenes that
+went one lies between this and 0, but floors and walls of which little was measured do, and what is hardly a thing."""
 INSTEAD = 0.3
 """Share of a new thing's pixels where the old map showed things that are gone, from which it was not there before."""
 FRAGMENT = 0.3, 3
@@ -88,7 +88,8 @@ def seen_today(visit: Visit) -> Today:
         before = visit.looks(visit.gaussians, visit.ids)
         signs = _signs(visit, before)
     entries = gmap.instances
-    gone = [e["id"] for e, s in zip(entries, signs, strict=True) if not is_removed(e) and s.seen and s.log_odds < GONE]
+    judged = [(e["id"], s) for e, s in zip(entries, signs, strict=True) if s.seen and not is_removed(e)]
+    gone = [i for i, s in judged if s.score * s.log_odds < GONE]
     stays = np.flatnonzero(~np.isin(visit.ids, gone))
     held, ids, kept = visit.gaussians.rows(torch.from_numpy(stays)), visit.ids[stays], visit.rows[stays]
     with run.stage("look"):
