@@ -59,6 +59,9 @@ HUES = -35.0, 0.07
 """Log-odds of being one thing per unit of difference between the shares of red, green and blue in its colours and in
 the photos', and where that says nothing. Of pairs that were compared in made scenes, 134 of 142 right ones have
 positive log-odds, and 4 of 88 wrong ones that are no look-alikes."""
+GREY = -1.5
+"""The same without colours, where histograms of brightness say nothing: of 53 pairs compared in made scenes 16 of 26
+right ones are above, and 2 of 27 wrong ones."""
 CLOSE = 1.5
 """Log-odds within which two motions, or two look-alikes, cannot be told apart."""
 WITHIN = 0.25
@@ -300,16 +303,19 @@ def settled(
     ambiguous = any(other.same > signs.same - CLOSE for other, _ in others)
     if axis is None and not ambiguous and signs.correlation < SURE:
         ambiguous = signs.correlation < UNLIKE or other_sides(old, pose, cuts, up, depth, seen)
-    odds = signs.same + LOOKS[0] * (alike - LOOKS[1]) + hue_odds(old, pose, cuts)
+    odds = signs.same + colour_odds(old, pose, cuts, alike)
     return Motion(pose, odds, ambiguous, axis)
 
 
-def hue_odds(old: Gaussians, pose: np.ndarray, cuts: Sequence[Cut]) -> float:
-    """Log-odds that an old thing is the one that photos show after the motion `pose`, by their hues: a mean over all
-    pixels is known better than the colour of each, and brightness, which light changes, is left out."""
-    sums = np.sum([cut.colours(old, pose) for cut in cuts], axis=0)
+def colour_odds(old: Gaussians, pose: np.ndarray, cuts: Sequence[Cut], alike: float) -> float:
+    """Log-odds that an old thing is the one that photos show after the motion `pose`, by what the histograms of their
+    colours have in common, `alike`, and by their hues: a mean over all pixels is known better than the colour of each,
+    and brightness, which light changes, is left out."""
+    if (old.sh == old.sh[..., :1]).all():
+        return GREY
+    odds, sums = LOOKS[0] * (alike - LOOKS[1]), np.sum([cut.colours(old, pose) for cut in cuts], axis=0)
     totals = sums.sum(axis=1, keepdims=True)
-    return HUES[0] * (float(np.abs(np.subtract(*(sums / totals))).sum()) - HUES[1]) if totals.all() else 0.0
+    return odds + (HUES[0] * (float(np.abs(np.subtract(*(sums / totals))).sum()) - HUES[1]) if totals.all() else 0.0)
 
 
 def round_about(old: Gaussians, motion: Found, cuts: Sequence[Cut], up: np.ndarray, depth: float) -> np.ndarray | None:

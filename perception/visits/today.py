@@ -23,7 +23,7 @@ from perception.visits.growth import (
     trained,
     update_config,
 )
-from perception.visits.look import Look
+from perception.visits.look import Look, in_grey
 from perception.visits.motion import (
     ALIKE,
     CERTAIN,
@@ -301,8 +301,10 @@ def _settled(
         [membership[stays]],
         [part_ids[stays]],
     )
+    hues = [visit.hues(gaussians_of(gmap, kept)), torch.zeros(len(stays) - len(kept), 3)]
     for i, (_, motion) in pairs.items():
         own = visit.rows_of(i)
+        hues.append(visit.hues(visit.own(i)))
         placed.append(carried(visit.thing(i), motion.new_from_old))
         names.append(np.full(len(placed[-1]), i, np.int32))
         back = i in visit.away  # without rows in the map
@@ -315,6 +317,8 @@ def _settled(
         run, "settle", visit.mark, visit.masks["identity"], together, len(together), visit.photos, config
     )
     unseen = (final.sh[: len(kept)] == start[: len(kept)]).flatten(1).all(dim=1)
+    final = in_grey(final) if visit.grey else final
+    final.sh[:, 0] += torch.cat(hues)
     original = torch.from_numpy(gmap.sh[kept])
     final.sh[: len(kept)] = torch.where(unseen[:, None, None], original, final.sh[: len(kept)])
     rest = np.setdiff1d(np.flatnonzero(~np.isin(gmap.instance_ids, gone)), visit.rows)  # no photo may show these

@@ -35,6 +35,7 @@ from perception.pipeline.instances import DescribedInstances, describe
 from perception.pipeline.optimise import Optimised, Run
 from perception.pipeline.record import finite, score_views
 from perception.progress import QUIET, Progress
+from perception.visits.look import in_grey
 from perception.visits.record import (
     joined_language,
     kept_parts,
@@ -145,7 +146,7 @@ def assembled(visit: Visit, today: Today, described: DescribedInstances, output:
         state = {"state": "unchanged" if known else "added", "confidence": round(entry["score"], 3)}
         instances.append({**entry, "id": i, **state, **seen})
     with run.stage("score"):
-        quality = score_views(gaussians, visit.photos.held, gmap.metric)
+        quality = score_views(in_grey(gaussians) if visit.grey else gaussians, visit.photos.held, gmap.metric)
         quality["views"] = {prefix + name: figures for name, figures in quality["views"].items()}
     arrays = {name: getattr(gaussians, name).numpy() for name in TENSORS}
     fresh = slice(len(today.kept), None)

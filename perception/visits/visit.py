@@ -25,6 +25,8 @@ from perception.visits.look import (
     Look,
     compared,
     depth_at,
+    grey_photo,
+    in_grey,
     in_light,
     in_view,
     look,
@@ -51,9 +53,10 @@ def gaussians_of(gmap: Map, rows: np.ndarray) -> Gaussians:
 @dataclass
 class Visit:
     """The photos of a visit against the map. number: of the visit; rows [R]: of the map's Gaussians, those that a photo
-    may show; gaussians: these, in the light of the visit, with instances ids [R]; light [3]: its colours over the
-    map's; photos: exposed and labelled; stereo: depths of the training photos; masks: report; mark: of its training;
-    left_out: names of photos that are not used, and why."""
+    may show; gaussians: these as the visit sees them (`seen`), with instances ids [R]; light [3]: its colours over the
+    map's; grey: whether brightness alone is compared, as either the photos or the map have no colours; photos: exposed
+    and labelled; stereo: depths of the training photos; masks: report; mark: of its training; left_out: names of photos
+    that are not used, and why."""
 
     run: Run
     gmap: Map
@@ -61,6 +64,7 @@ class Visit:
     rows: np.ndarray
     gaussians: Gaussians
     light: np.ndarray
+    grey: bool
     photos: Photos
     stereo: list[StereoView | None]
     masks: dict[str, Any]
@@ -77,10 +81,22 @@ class Visit:
         rows = np.flatnonzero(self.gmap.instance_ids == instance)
         return rows[compact(self.gmap.means[rows].astype(np.float64))]
 
-    def thing(self, instance: int) -> Gaussians:
-        """These Gaussians, in the light of the visit; of a removed instance as it was."""
+    def own(self, instance: int) -> Gaussians:
+        """These Gaussians as the map has them; of a removed instance as it was."""
         known = self.away.get(instance)
-        return in_light(gaussians_of(self.gmap, self.rows_of(instance)) if known is None else known, self.light)
+        return gaussians_of(self.gmap, self.rows_of(instance)) if known is None else known
+
+    def seen(self, gaussians: Gaussians) -> Gaussians:
+        """Gaussians of the map in the light of the visit, without colours if it is compared in grey."""
+        return in_light(in_grey(gaussians) if self.grey else gaussians, self.light)
+
+    def hues(self, gaussians: Gaussians) -> torch.Tensor:
+        """[N, 3] what `seen` takes from the constant colour coefficients of Gaussians of the map besides the light."""
+        return in_light(gaussians, self.light).sh[:, 0] - self.seen(gaussians).sh[:, 0]
+
+    def thing(self, instance: int) -> Gaussians:
+        """The Gaussians of an instance as the visit sees them."""
+        return self.seen(self.own(instance))
 
     @cached_property
     def away(self) -> dict[int, Gaussians]:
@@ -123,9 +139,10 @@ def open_visit(run: Run, gmap: Map, source: MaskSource, output: Path) -> Visit:
             photos = checked_poses(run, gmap, photos)
     rows = np.flatnonzero(in_view(gmap.means, gmap.scales.max(axis=1), [*photos.views, *photos.held]))
     old, ids = gaussians_of(gmap, rows), gmap.instance_ids[rows]
-    if one_is_grey(old, photos.views):
-        both = "the photos are grey and the map is not, or the map is: what moved may be told as removed and added"
-        run.progress.log(f"warning: {run.source}: {both}; give photos like those of the map")
+    if grey := without_colours(old, photos.views):
+        run.progress.log("the photos or the map have no colours: brightness alone is compared")
+        photos = replace(photos, views=[*map(grey_photo, photos.views)], held=[*map(grey_photo, photos.held)])
+        old = in_grey(old)
     with run.stage("look"):
         photos, light = _exposed(old, photos)
         lit = in_light(old, light)
@@ -143,14 +160,14 @@ def open_visit(run: Run, gmap: Map, source: MaskSource, output: Path) -> Visit:
     )
     number = len(gmap.info.get("visits") or [0])
     mark = digest(gmap.map_id, training_mark(run.source, run.config), source.identity)
-    return Visit(run, gmap, number, rows, lit, light, photos, stereo, masks, mark, left_out)
+    return Visit(run, gmap, number, rows, lit, light, grey, photos, stereo, masks, mark, left_out)
 
 
-def one_is_grey(old: Gaussians, views: Sequence[TrainingView]) -> bool:
-    """Whether the photos have no colours and the Gaussians do, or the other way round."""
-    photos = all(float(np.ptp(view.photo.numpy(), axis=2).mean()) < GREY for view in views)
-    mapped = 255 * float(np.ptp(rgb_from_sh(old.sh[:, 0].numpy()), axis=1).mean())
-    return len(old) > 0 and photos != (mapped < GREY)
+def without_colours(old: Gaussians, views: Sequence[TrainingView]) -> bool:
+    """Whether the photos have no colours, or the Gaussians have none."""
+    photos = max((float(np.ptp(view.photo.numpy(), axis=2).mean()) for view in views), default=GREY)
+    mapped = 255 * float(np.ptp(rgb_from_sh(old.sh[:, 0].numpy()), axis=1).mean()) if len(old) else GREY
+    return min(photos, mapped) < GREY
 
 
 def _told(run: Run, left_out: Sequence[dict[str, str]]) -> list[dict[str, str]]:

@@ -30,4 +30,13 @@ def test_kept_rows_are_not_run_again(tmp_path: Path, capsys: pytest.CaptureFixtu
         row = json.dumps({"cpu_seconds": seconds, "seconds": seconds, "psnr": 30.0})
         (tmp_path / f"out/demo-{name}-4.json").write_text(row, encoding="utf-8")
     main([str(tmp_path), "demo", "--seeds", "4", "-o", str(tmp_path / "out")])
-    assert capsys.readouterr().out.splitlines()[2].split() == ["demo", "this", "6", "6", "30.00", *"---", "0.75", "0.75"]
+    assert capsys.readouterr().out.splitlines()[2].split() == [
+        "demo",
+        "this",
+        "6",
+        "6",
+        "30.00",
+        *"---",
+        "0.75",
+        "0.75",
+    ]

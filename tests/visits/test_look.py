@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
 
-from perception.gaussians.views import TrainingView
+from perception.gaussians.model import Gaussians
+from perception.gaussians.views import TrainingView, render
 from perception.types import View
-from perception.visits.look import Look, depth_at, moments, stereo_of
+from perception.visits.look import Look, depth_at, grey_photo, in_grey, moments, stereo_of
 
 H, W = 120, 160
 K = np.array([[150.0, 0, W / 2], [0, 150.0, H / 2], [0, 0, 1]])
@@ -61,3 +63,29 @@ def test_a_plain_new_thing_is_not_drawn_to_the_surface_behind_it() -> None:
         assert stereo is not None
         off = np.abs(depth_at(stereo, (H, W), confirmed=False) / depth - 1) < 0.03
         assert off[depth == BOX].mean() > 0.9 and off[depth == WALL].mean() > 0.95
+
+
+def test_the_map_in_grey_is_the_grey_of_its_render() -> None:
+    """Pillow's brightness of a photo, and of a render of coloured harmonics."""
+    generator = torch.Generator().manual_seed(0)
+    n, pose = 300, torch.eye(4)
+    pose[2, 3] = 2.0
+    gaussians = Gaussians(
+        means=torch.rand(n, 3, generator=generator) - 0.5,
+        quats=torch.randn(n, 4, generator=generator),
+        log_scales=torch.full((n, 3), -3.0),
+        opacity_logits=torch.zeros(n),
+        sh=0.1 * torch.randn(n, 16, 3, generator=generator),  # no colour below 0
+        features=torch.zeros(n, 2),
+    )
+    colours, grey = (
+        render(g, pose, torch.from_numpy(K).float(), W, H, harmonics=True).colors[0]
+        for g in (gaussians, in_grey(gaussians))
+    )
+    image = (255 * colours.clamp(0, 1)).to(torch.uint8)
+    pillow = np.asarray(Image.fromarray(image.numpy()).convert("L"))
+    inside = ((colours > 0) & (colours < 1)).all(dim=2).numpy()
+    assert inside.mean() > 0.5
+    assert np.abs(255 * grey.numpy() - pillow[..., None])[inside].max() < 2.0  # two roundings to 8 bits
+    view = TrainingView("a", image, None, torch.from_numpy(K).float(), pose)
+    assert np.abs(grey_photo(view).photo.numpy().astype(int) - pillow[..., None]).max() <= 1

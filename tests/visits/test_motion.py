@@ -17,7 +17,18 @@ from perception.gaussians.views import TrainingView, render
 from perception.instances.group import Grouping
 from perception.types import View
 from perception.visits.look import seen_from
-from perception.visits.motion import HUES, Cut, _upright_starts, assigned, hue_odds, judged, other_sides, refined
+from perception.visits.motion import (
+    GREY,
+    HUES,
+    LOOKS,
+    Cut,
+    _upright_starts,
+    assigned,
+    colour_odds,
+    judged,
+    other_sides,
+    refined,
+)
 from perception.visits.registration import Points, angle_between, carried, compact, looks_round, register
 from perception.visits.today import _apart, _without_fragments
 from support.aimed import look_at
@@ -139,9 +150,11 @@ def test_the_hue_of_a_thing_is_compared_whatever_its_brightness(shown: tuple[flo
     cuts = photographed(painted([light * c for c in shown]), true, ((0.6, 0.1, 0.4), (-0.3, 0.5, 0.4)))
     differ = sum(abs(a / sum(old) - b / sum(shown)) for a, b in zip(old, shown, strict=True))
     # Photos have 8 bits, cut off: up to 1/255 of each colour.
-    assert hue_odds(painted(old), true, cuts) == pytest.approx(HUES[0] * (differ - HUES[1]), abs=-HUES[0] * 0.02)
+    odds = colour_odds(painted(old), true, cuts, LOOKS[1] + 0.1)
+    assert odds == pytest.approx(0.1 * LOOKS[0] + HUES[0] * (differ - HUES[1]), abs=-HUES[0] * 0.02)
     away = motion(0.0, (9.0, 9.0, 0.0))
-    assert hue_odds(painted(old), away, cuts) == 0.0, "where no photo looks nothing is known"
+    assert colour_odds(painted(old), away, cuts, LOOKS[1]) == 0.0, "where no photo looks nothing is known"
+    assert colour_odds(painted((0.4, 0.4, 0.4)), true, cuts, 1.0) == GREY, "nor where nothing has a colour"
 
 
 def test_another_turn_is_excluded_only_where_the_sides_that_it_would_show_were_seen() -> None:

@@ -22,7 +22,7 @@ from perception.visits.look import Look
 from perception.visits.record import visit_record
 from perception.visits.scene import foreign_photos, refuse_older, update_settings
 from perception.visits.update import update_map
-from perception.visits.visit import one_is_grey
+from perception.visits.visit import without_colours
 from support.visited_map import number, write_visited_map
 
 TAKEN, OFFSET = 0x9003, 0x9011  # EXIF DateTimeOriginal and OffsetTimeOriginal
@@ -111,10 +111,10 @@ def test_a_finished_update_is_that_of_the_same_photos_and_the_same_map(tmp_path:
         update_map(old, source, new, config, resume=True)
 
 
-def test_grey_photos_of_a_map_with_colours_are_told() -> None:
+def test_photos_or_maps_without_colours_are_known() -> None:
     colours = torch.tensor([[200, 30, 30], [30, 90, 200], [120, 120, 120]], dtype=torch.uint8)
     grey = torch.tensor([[90, 90, 90], [91, 90, 89], [20, 20, 20]], dtype=torch.uint8)
     generator, zeros = torch.Generator().manual_seed(0), np.zeros((3, 3))
     maps = [isotropic(zeros, torch.zeros(3), rgb / 255, 0.9, 4, generator) for rgb in (colours, grey)]
     views: list[Any] = [[SimpleNamespace(photo=rgb[None])] for rgb in (colours, grey)]
-    assert [[one_is_grey(one, photos) for photos in views] for one in maps] == [[False, True], [True, False]]
+    assert [[without_colours(one, photos) for photos in views] for one in maps] == [[False, True], [True, True]]

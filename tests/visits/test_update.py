@@ -112,6 +112,27 @@ def test_an_update_is_repeatable_and_leaves_the_old_map(world: Path, new: Map) -
     assert all(one[name] == other[name] for name in one if name != "map.json")  # which holds seconds
 
 
+def test_a_visit_with_a_grey_camera_leaves_the_colours(world: Path, new: Map) -> None:
+    """What stays keeps its hue in the light of the visit, one number; what is new is grey, and what went is told."""
+    old, grey = read_map(world / "old.gsmap"), world / "grey"
+    shutil.copytree(world / "visit1", grey)
+    for file in (grey / "images").iterdir():
+        cv2.imwrite(str(file), cv2.imread(str(file), cv2.IMREAD_GRAYSCALE))
+    config = update_settings(world / "old.gsmap", None, [f"masks=labels:{grey / 'labels'}"])
+    made = update_map(world / "old.gsmap", grey, world / "grey.gsmap", config)
+    where = {mean.tobytes(): i for i, mean in enumerate(old.means)}
+    pairs = np.array([(i, where[mean.tobytes()]) for i, mean in enumerate(made.means) if mean.tobytes() in where])
+    constant = [m.sh[i, 0] for m, i in zip((made, old), pairs.T, strict=True)]
+    now, then = (sh - (sh @ [0.299, 0.587, 0.114])[:, None] for sh in constant)
+    seen = (made.sh[pairs[:, 0]] != old.sh[pairs[:, 1]]).any(axis=(1, 2))
+    light = np.sum(now[seen] * then[seen]) / np.sum(then[seen] ** 2)
+    assert seen.sum() > 1000 and 0.5 < light < 2
+    np.testing.assert_allclose(now[seen], light * then[seen], atol=1e-4)
+    assert np.ptp(made.sh[np.setdiff1d(np.arange(len(made)), pairs[:, 0]), 0], axis=1).max() < 1e-3
+    gone = [{e["id"] for e in m.instances if e["state"] == "removed"} for m in (made, new)]
+    assert gone[0] == gone[1] != set()
+
+
 def test_a_visit_without_changes_adds_nothing(world: Path) -> None:
     first = world / "visit0"
     config = update_settings(world / "old.gsmap", None, [f"masks=labels:{first / 'labels'}"])

@@ -2,15 +2,15 @@
 
 python tools score.made_visits tabletop|room WORK --seeds N ... [--visits N] [--side PX] [--views N]
     [--share KIND=X ...] [--corner SHARE] [--masks labels|labels_sam|builtin] [--alone] [--apart] [--back]
-    [--set KEY=VALUE ...]
+    [--grey] [--set KEY=VALUE ...]
 
 Makes the visits of `worlds.visits` (400 × 300 pixels, 36 or 56 photos), the map of the first one (1000 iterations,
 without language), and updates it visit after visit. A row for each visit, then mean, spread and range over all of them,
 and what came true of the states, by confidence. Given poses, unless --alone. --share: of the things, by kind of change
 (moved, turned, removed, added, swapped); none=0: only the light changes. --corner: later visits use that share of their
-photos, the first ones by name. --apart: also a new map of every visit, for its PSNR and its CPU seconds. --back: then a
-visit that finds the place as the first one did; `back` is the share of the things said to be removed that have their
-ids again where they stood.
+photos, the first ones by name. --grey: their photos have no colours. --apart: also a new map of every visit, for its
+PSNR and its CPU seconds. --back: then a visit that finds the place as the first one did; `back` is the share of the
+things said to be removed that have their ids again where they stood.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from PIL import Image
 
 from perception.config import load_config
 from perception.map.history import changes_of, is_removed, visits_of
@@ -72,6 +73,17 @@ def cornered(folder: Path, share: float) -> Path:
     return file
 
 
+def grey(folder: Path) -> Path:
+    """A copy of the visit, beside it, whose photos have no colours."""
+    copy = folder.with_name(f"{folder.name}-grey")
+    if not copy.exists():
+        shutil.copytree(folder, copy, copy_function=shutil.copyfile)  # newer photos
+        for file in sorted((copy / "images").iterdir()):
+            with Image.open(file) as photo:
+                photo.convert("L").save(file)
+    return copy
+
+
 def scored(folder: Path, given: argparse.Namespace) -> list[dict[str, Any]]:
     """A row for each visit but the first."""
     pairs = [*SETTINGS, *given.pairs]
@@ -87,6 +99,7 @@ def scored(folder: Path, given: argparse.Namespace) -> list[dict[str, Any]]:
     start = (read_map(path), float("nan")) if path.exists() else new_map(folder / "visit0", path)
     for number in range(1, given.visits):
         before, visit = read_map(path), folder / f"visit{number}"
+        visit = grey(visit) if given.grey else visit
         source = visit / "images" if given.alone else cornered(visit, given.corner) if given.corner < 1 else visit
         old, path = path, folder / f"{name}-{number}.gsmap"
         shutil.rmtree(path, ignore_errors=True)
@@ -158,7 +171,7 @@ def main() -> None:
     parser.add_argument("--share", nargs="+", default=[])
     parser.add_argument("--corner", type=float, default=1.0)
     parser.add_argument("--masks", choices=("labels", "labels_sam", "builtin"), default="labels")
-    for flag in ("--alone", "--apart", "--back"):
+    for flag in ("--alone", "--apart", "--back", "--grey"):
         parser.add_argument(flag, action="store_true")
     parser.add_argument("--set", action="append", default=[], dest="pairs")
     given = parser.parse_args()
