@@ -22,8 +22,6 @@ WINDOW = 3.0
 """Standard deviation in pixels of the window in which brightness is compared: a few times the error of a silhouette."""
 DARK, BRIGHT = 0.04, 0.96
 """Colours beyond are clipped or mostly noise, and do not show the exposure."""
-LUMA = (0.299, 0.587, 0.114)
-"""Shares of red, green and blue in the brightness of a grey photo (ITU-R BT.601, as Pillow and OpenCV have it)."""
 DIFFERENT = 0.1
 """Mean difference of colour, of 1, from which a pixel shows something else than the map."""
 
@@ -113,28 +111,6 @@ def _log_gain(gaussians: Gaussians, view: TrainingView) -> np.ndarray:
     if usable.sum() < 100:
         return np.full(3, np.nan)
     return np.asarray(np.median(np.log(photo[usable] / image[usable]), axis=0))
-
-
-def in_light(gaussians: Gaussians, light: np.ndarray) -> Gaussians:
-    """The Gaussians with their colours times light [3]: colour = ½ + C₀ sh₀ + …"""
-    from perception.colors import rgb_from_sh, sh_from_rgb
-
-    gain = torch.from_numpy(light.astype(np.float32))
-    sh = gaussians.sh * gain
-    sh[:, 0] = sh_from_rgb(rgb_from_sh(gaussians.sh[:, 0]) * gain)
-    return replace(gaussians, sh=sh)
-
-
-def in_grey(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians as a camera without colours sees them. Brightness is linear in the harmonics, as colours are."""
-    grey = (gaussians.sh @ torch.tensor(LUMA))[..., None]
-    return replace(gaussians, sh=grey.repeat(1, 1, 3))
-
-
-def grey_photo(view: TrainingView) -> TrainingView:
-    """The view as a camera without colours sees it."""
-    grey = (view.photo.float() @ torch.tensor(LUMA) + 0.5).to(torch.uint8)[..., None]
-    return replace(view, photo=grey.repeat(1, 1, 3))
 
 
 def look(gaussians: Gaussians, ids: np.ndarray, view: TrainingView, measured: np.ndarray) -> Look:

@@ -19,6 +19,7 @@ from perception.gaussians.views import TrainingView, expected_depth, render
 from perception.geometry import transform
 from perception.rasterizer.rasterize import rasterizer_for
 from perception.rasterizer.types import Settings
+from perception.visits.colours import LUMA, colour_odds
 from perception.visits.evidence import WEIGHTS, Signs, signs_from, sums_in
 from perception.visits.look import Look, blurred, projected
 from perception.visits.registration import BEST, TURNED, YAWS, Points, angle_between, looks_round, register, turns
@@ -48,20 +49,8 @@ GAINS, SHORTER = 0.1, 3
 """Log-odds below which a gain of refinement makes its steps shorter, and how much."""
 BEHIND = 5.0
 """Log-odds by which a first guess may be behind the best one, to be refined as well."""
-GRAY = np.array([0.299, 0.587, 0.114], np.float32)
-"""Brightness of a colour."""
 ROUGH_STEP, STEP, LEAST_STEP = 0.4, 0.1, 0.03
 """Steps of a motion in refinement, from a rough one down: radii of the thing, and radians."""
-LOOKS = 8.0, 0.45
-"""Log-odds of being one thing per unit of what two histograms have in common, and where that says nothing: the same
-things share .5 to .75 between visits, others up to .5."""
-HUES = -35.0, 0.07
-"""Log-odds of being one thing per unit of difference between the shares of red, green and blue in its colours and in
-the photos', and where that says nothing. Of pairs that were compared in made scenes, 134 of 142 right ones have
-positive log-odds, and 4 of 88 wrong ones that are no look-alikes."""
-GREY = -1.5
-"""The same without colours, where histograms of brightness say nothing: of 53 pairs compared in made scenes 16 of 26
-right ones are above, and 2 of 27 wrong ones."""
 CLOSE = 1.5
 """Log-odds within which two motions, or two look-alikes, cannot be told apart."""
 WITHIN = 0.25
@@ -113,7 +102,7 @@ class Cut:
     def _photo(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """[h, w, 3] colours in [0, 1]; [h, w] its brightness, the local mean and variance of that."""
         photo = self.view.photo.numpy().astype(np.float32) / 255
-        gray = photo @ GRAY
+        gray = photo @ LUMA
         mean = blurred(gray)
         return photo, gray, mean, blurred(gray * gray) - mean**2
 
@@ -167,7 +156,7 @@ class Cut:
         view, (images, mapped, shown) = self.view, self._before_all(thing, motions)
         colour = np.abs(images - photo).mean(axis=3)
         rows = []
-        for n, image in enumerate(images @ GRAY):
+        for n, image in enumerate(images @ LUMA):
             local = blurred(image)
             moment = blurred(image * gray) - local * mean, blurred(image * image) - local**2, variance
             look = Look(view, mapped[n], self.measured, shown[n], *moment, colour[n])
@@ -289,7 +278,7 @@ def settled(
     seen: np.ndarray,
 ) -> Motion | None:
     """The best of the two best motions after refinement, and whether the other explains the photos as well; None where
-    much of the thing would lie within others. alike: see `looks_alike`; seen: see `look.seen_from`."""
+    much of the thing would lie within others. alike: see `colours.looks_alike`; seen: see `look.seen_from`."""
     likely = [each for each in found[:2] if each[0].same > found[0][0].same - BEHIND]
     refine = _distinct([refined(old, each, cuts, depth, STEP, LEAST_STEP) for each in likely])
     (signs, pose), others = refine[0], refine[1:]
@@ -303,19 +292,9 @@ def settled(
     ambiguous = any(other.same > signs.same - CLOSE for other, _ in others)
     if axis is None and not ambiguous and signs.correlation < SURE:
         ambiguous = signs.correlation < UNLIKE or other_sides(old, pose, cuts, up, depth, seen)
-    odds = signs.same + colour_odds(old, pose, cuts, alike)
+    sums = np.sum([cut.colours(old, pose) for cut in cuts], axis=0)
+    odds = signs.same + colour_odds(old, alike, sums)
     return Motion(pose, odds, ambiguous, axis)
-
-
-def colour_odds(old: Gaussians, pose: np.ndarray, cuts: Sequence[Cut], alike: float) -> float:
-    """Log-odds that an old thing is the one that photos show after the motion `pose`, by what the histograms of their
-    colours have in common, `alike`, and by their hues: a mean over all pixels is known better than the colour of each,
-    and brightness, which light changes, is left out."""
-    if (old.sh == old.sh[..., :1]).all():
-        return GREY
-    odds, sums = LOOKS[0] * (alike - LOOKS[1]), np.sum([cut.colours(old, pose) for cut in cuts], axis=0)
-    totals = sums.sum(axis=1, keepdims=True)
-    return odds + (HUES[0] * (float(np.abs(np.subtract(*(sums / totals))).sum()) - HUES[1]) if totals.all() else 0.0)
 
 
 def round_about(old: Gaussians, motion: Found, cuts: Sequence[Cut], up: np.ndarray, depth: float) -> np.ndarray | None:

@@ -37,8 +37,6 @@ ROUND, DARKEST = 1.6, 0.1
 """Distance of the points of a thing after a turn, relative to that between its halves, up to which it may be round:
 bowls and plates have 1.1 to 1.4, cans and cartons, whose print the photos see, 1.4 to 2.4. Least sum of colours of a
 hue."""
-BINS = 6
-"""Of each colour in the histograms of things."""
 
 
 @dataclass(frozen=True)
@@ -203,13 +201,3 @@ def looks_round(points: Points, axis: np.ndarray) -> bool:
 
     unturned, *turned = map(off, turns(axis, YAWS))
     return max(turned) < ROUND * unturned
-
-
-def looks_alike(old: Gaussians, new: Gaussians) -> float:
-    """Share in [0, 1] that the histograms of the colours of two things have in common."""
-    histograms = []
-    for each in (old, new):
-        colors = Points.of(each).colors
-        counts = np.histogramdd(colors, bins=BINS, range=[(0, 1)] * 3)[0]
-        histograms.append(counts / max(counts.sum(), 1))
-    return float(np.minimum(*histograms).sum())

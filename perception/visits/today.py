@@ -12,6 +12,7 @@ from perception.gaussians.state import TrainRecord
 from perception.instances.group import Grouping
 from perception.instances.votes import mask_votes
 from perception.map.history import is_removed
+from perception.visits.colours import LOOKS, in_grey, looks_alike
 from perception.visits.evidence import Signs, seen_rows, signs_of
 from perception.visits.growth import (
     GROWING,
@@ -23,20 +24,19 @@ from perception.visits.growth import (
     trained,
     update_config,
 )
-from perception.visits.look import Look, in_grey
+from perception.visits.look import Look
 from perception.visits.motion import (
     ALIKE,
     CERTAIN,
     CLOSE,
     HOPELESS,
-    LOOKS,
     TWINS,
     Motion,
     assigned,
     motions_of,
     settled,
 )
-from perception.visits.registration import REACH, Points, carried, looks_alike
+from perception.visits.registration import REACH, Points, carried
 from perception.visits.visit import Visit, gaussians_of
 
 UP = (0.0, 0.0, 1.0)

@@ -35,7 +35,7 @@ from perception.pipeline.instances import DescribedInstances, describe
 from perception.pipeline.optimise import Optimised, Run
 from perception.pipeline.record import finite, score_views
 from perception.progress import QUIET, Progress
-from perception.visits.look import in_grey
+from perception.visits.colours import in_grey
 from perception.visits.record import (
     joined_language,
     kept_parts,

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from perception.colors import rgb_from_sh
 from perception.gaussians.model import Gaussians
 from perception.gaussians.photos import split_scene
 from perception.gaussians.views import TrainingView
@@ -21,13 +20,11 @@ from perception.masks import MaskSource
 from perception.masks.stereo import StereoView
 from perception.pipeline.checkpoint import digest, training_mark
 from perception.pipeline.optimise import Photos, Run, label_photos
+from perception.visits.colours import grey_photo, in_grey, in_light, without_colours
 from perception.visits.look import (
     Look,
     compared,
     depth_at,
-    grey_photo,
-    in_grey,
-    in_light,
     in_view,
     look,
     seen_from,
@@ -39,8 +36,6 @@ from perception.visits.record import as_it_was
 from perception.visits.registration import compact
 from perception.visits.scene import foreign_photos, refuse_older, visit_scene
 
-GREY = 2.0
-"""Mean difference of a pixel's channels, in grey levels, below which a photo has no colours."""
 TENSORS = ("means", "quats", "log_scales", "opacity_logits", "sh", "features")
 """Of `Gaussians`, and fields of a map."""
 
@@ -161,13 +156,6 @@ def open_visit(run: Run, gmap: Map, source: MaskSource, output: Path) -> Visit:
     number = len(gmap.info.get("visits") or [0])
     mark = digest(gmap.map_id, training_mark(run.source, run.config), source.identity)
     return Visit(run, gmap, number, rows, lit, light, grey, photos, stereo, masks, mark, left_out)
-
-
-def without_colours(old: Gaussians, views: Sequence[TrainingView]) -> bool:
-    """Whether the photos have no colours, or the Gaussians have none."""
-    photos = max((float(np.ptp(view.photo.numpy(), axis=2).mean()) for view in views), default=GREY)
-    mapped = 255 * float(np.ptp(rgb_from_sh(old.sh[:, 0].numpy()), axis=1).mean()) if len(old) else GREY
-    return min(photos, mapped) < GREY
 
 
 def _told(run: Run, left_out: Sequence[dict[str, str]]) -> list[dict[str, str]]:

@@ -11,7 +11,8 @@ from PIL import Image
 from perception.gaussians.model import Gaussians
 from perception.gaussians.views import TrainingView, render
 from perception.types import View
-from perception.visits.look import Look, depth_at, grey_photo, in_grey, moments, stereo_of
+from perception.visits.colours import grey_photo, in_grey
+from perception.visits.look import Look, depth_at, moments, stereo_of
 
 H, W = 120, 160
 K = np.array([[150.0, 0, W / 2], [0, 150.0, H / 2], [0, 0, 1]])

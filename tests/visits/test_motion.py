@@ -16,15 +16,12 @@ from perception.gaussians.model import Gaussians, isotropic
 from perception.gaussians.views import TrainingView, render
 from perception.instances.group import Grouping
 from perception.types import View
+from perception.visits.colours import GREY, HUES, LOOKS, colour_odds
 from perception.visits.look import seen_from
 from perception.visits.motion import (
-    GREY,
-    HUES,
-    LOOKS,
     Cut,
     _upright_starts,
     assigned,
-    colour_odds,
     judged,
     other_sides,
     refined,
@@ -150,11 +147,15 @@ def test_the_hue_of_a_thing_is_compared_whatever_its_brightness(shown: tuple[flo
     cuts = photographed(painted([light * c for c in shown]), true, ((0.6, 0.1, 0.4), (-0.3, 0.5, 0.4)))
     differ = sum(abs(a / sum(old) - b / sum(shown)) for a, b in zip(old, shown, strict=True))
     # Photos have 8 bits, cut off: up to 1/255 of each colour.
-    odds = colour_odds(painted(old), true, cuts, LOOKS[1] + 0.1)
+
+    def odds_of(color: Sequence[float], pose: np.ndarray, alike: float) -> float:
+        return colour_odds(painted(color), alike, np.sum([cut.colours(painted(color), pose) for cut in cuts], axis=0))
+
+    odds = odds_of(old, true, LOOKS[1] + 0.1)
     assert odds == pytest.approx(0.1 * LOOKS[0] + HUES[0] * (differ - HUES[1]), abs=-HUES[0] * 0.02)
     away = motion(0.0, (9.0, 9.0, 0.0))
-    assert colour_odds(painted(old), away, cuts, LOOKS[1]) == 0.0, "where no photo looks nothing is known"
-    assert colour_odds(painted((0.4, 0.4, 0.4)), true, cuts, 1.0) == GREY, "nor where nothing has a colour"
+    assert odds_of(old, away, LOOKS[1]) == 0.0, "where no photo looks nothing is known"
+    assert odds_of((0.4, 0.4, 0.4), true, 1.0) == GREY, "nor where nothing has a colour"
 
 
 def test_another_turn_is_excluded_only_where_the_sides_that_it_would_show_were_seen() -> None:

@@ -18,11 +18,11 @@ from perception.gaussians.views import TrainingView
 from perception.map.write import read_map, set_labels, write_map
 from perception.pipeline.changes import inputs_of
 from perception.pipeline.checkpoint import digest, fingerprint
+from perception.visits.colours import without_colours
 from perception.visits.look import Look
 from perception.visits.record import visit_record
 from perception.visits.scene import foreign_photos, refuse_older, update_settings
 from perception.visits.update import update_map
-from perception.visits.visit import without_colours
 from support.visited_map import number, write_visited_map
 
 TAKEN, OFFSET = 0x9003, 0x9011  # EXIF DateTimeOriginal and OffsetTimeOriginal
