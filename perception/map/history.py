@@ -7,6 +7,7 @@ state            as of the newest visit: "unchanged", "moved" (by this visit), "
                  earlier one) or "unseen" (this visit did not look there)
 confidence       of that state, in [0, 1]
 first_seen, last_seen, last_looked_for     numbers of visits
+hidden_before    true: no photo before first_seen looked where it stands, so that it is not known to have come
 past             where it stood before, oldest first: {"until", "centroid", "obb", "aabb", "transform", "ambiguous"}.
                  until: the visit before the one that found it to stand there no more, so entries ascend. transform:
                  [4, 4] that takes points from there to where it stood next (the next entry, else today's spot); null
@@ -48,7 +49,7 @@ PAST = {
 }  # fmt: skip
 RECORD = {
     "state?": State, "confidence?": Share, "first_seen?": Count, "last_seen?": Count, "last_looked_for?": Count,
-    "past?": [PAST],
+    "past?": [PAST], "hidden_before?": bool,
 }  # fmt: skip
 """Of an instance."""
 
@@ -151,7 +152,8 @@ def changes_of(visits: Sequence[Visit], instances: list[dict[str, Any]], start: 
 
 
 def _change(entry: dict[str, Any], start: int, newest: int) -> dict[str, Any] | None:
-    before, after = stood(entry, start), None if is_removed(entry) else entry
+    known = max(start, entry["first_seen"]) if entry.get("hidden_before") else start
+    before, after = stood(entry, known), None if is_removed(entry) else entry
     if before is None and after is None:
         return None
     later = [spot for spot in entry.get("past", ()) if spot["until"] >= start]
@@ -218,7 +220,8 @@ def joined_record(entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
     for key, choose in (("confidence", min), ("first_seen", min), ("last_seen", max), ("last_looked_for", max)):
         if values := [entry[key] for entry in entries if key in entry]:
             record[key] = choose(values)
-    return record
+    hidden = all(entry.get("hidden_before") for entry in entries)
+    return {**record, "hidden_before": True} if hidden and entries else record
 
 
 def past_of(past: dict[str, np.ndarray], instances: Iterable[dict[str, Any]]) -> dict[str, np.ndarray]:

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import torch
 
-from perception.gaussians.model import Gaussians, Nearby
+from perception.gaussians.model import Gaussians, Nearby, as_gaussians
 from perception.gaussians.state import TrainRecord
 from perception.instances.group import Grouping
 from perception.instances.votes import mask_votes
 from perception.map.history import is_removed
 from perception.visits.colours import LOOKS, in_grey, looks_alike
-from perception.visits.evidence import Signs, seen_rows, signs_of
+from perception.visits.evidence import Signs, in_free_space, looked_at, seen_rows, signs_of
 from perception.visits.growth import (
     GROWING,
     SETTLING,
@@ -44,6 +45,9 @@ UP = (0.0, 0.0, 1.0)
 GONE = -0.5
 """Log-odds of standing where it stood, times the score, below which a thing does not. Of 126 things of made scenes that
 went one lies between this and 0, but floors and walls of which little was measured do, and what is hardly a thing."""
+BUILDING = 0.6
+"""Of what a visit may see, the share from which a thing is a wall or a floor: it stays, and only what of its Gaussians
+the photos see through goes."""
 INSTEAD = 0.3
 """Share of a new thing's pixels where the old map showed things that are gone, from which it was not there before."""
 FRAGMENT = 0.3, 3
@@ -62,12 +66,19 @@ OUTLINED = 0.5
 """Least IoU of a new thing with masks of the photos, relative to the median of those that stand where they stood."""
 
 
+LOOKED_AT = 0.1
+"""Share of a new thing's place from which an earlier photo looked there."""
+
+New = Literal["added", "known", "hidden"]
+"""Of what the map has no instance: it came, the map showed it and did not know it as a thing, or no photo looked there
+before."""
+
+
 @dataclass
 class Today:
     """What stands where today: the Gaussians, of which the first rows are the rows `kept` [H] of the map; ids [N] int32
     instance, `membership` [N], part_ids [N]; signs of the map's instances, in their order; `gone`: ids of those that do
-    not stand where they stood; motions by id; `added`: of the new ones, by id, the score and whether the old map
-    showed it."""
+    not stand where they stood; motions by id; `added`: of the new ones, by id, the score and how it is new."""
 
     gaussians: Gaussians
     kept: np.ndarray
@@ -77,7 +88,7 @@ class Today:
     signs: list[Signs]
     gone: list[int]
     motions: dict[int, Motion]
-    added: dict[int, tuple[float, bool]]
+    added: dict[int, tuple[float, New]]
     record: TrainRecord
 
 
@@ -90,7 +101,12 @@ def seen_today(visit: Visit) -> Today:
     entries = gmap.instances
     judged = [(e["id"], s) for e, s in zip(entries, signs, strict=True) if s.seen and not is_removed(e)]
     gone = [i for i, s in judged if s.score * s.log_odds < GONE]
-    stays = np.flatnonzero(~np.isin(visit.ids, gone))
+    means = visit.gaussians.means.double().numpy()
+    span = np.ptp(np.quantile(means, [0.02, 0.98], axis=0), axis=0).max() if len(means) else 0.0
+    building = [e["id"] for e in entries if e["id"] in gone and max(e["obb"]["extent"]) > BUILDING * span]
+    gone = [i for i in gone if i not in building]
+    haze = np.isin(visit.ids, building) & in_free_space(before, means)
+    stays = np.flatnonzero(~np.isin(visit.ids, gone) & ~haze)
     held, ids, kept = visit.gaussians.rows(torch.from_numpy(stays)), visit.ids[stays], visit.rows[stays]
     with run.stage("look"):
         looks = visit.looks(held, ids)
@@ -289,10 +305,12 @@ def _settled(
     part_ids = np.concatenate([parts[kept], np.full(len(grown) - len(kept), -1, np.int32)])
     taken = {j for j, _ in pairs.values()} | pieces
     used = [entry["id"] for entry in gmap.instances] + [p["id"] for e in gmap.instances for p in e.get("parts", ())]
-    following, added = max(used, default=-1) + 1, dict[int, tuple[float, bool]]()
+    following, added = max(used, default=-1) + 1, dict[int, tuple[float, New]]()
+    means, whole = grown.means.double().numpy(), as_gaussians(gmap)
     for j, (rows, score) in enumerate(things):
         if j not in taken and score >= LEAST_SCORE:
-            ids[rows], added[following] = following, (score, j in old)
+            hidden = bool(gmap.views) and looked_at(whole, gmap.views, means[rows]).mean() < LOOKED_AT
+            ids[rows], added[following] = following, (score, "known" if j in old else "hidden" if hidden else "added")
             following += 1
     stays = np.setdiff1d(np.arange(len(grown)), _rows(things, taken))
     placed, names, members, owned = (
@@ -322,9 +340,9 @@ def _settled(
     original = torch.from_numpy(gmap.sh[kept])
     final.sh[: len(kept)] = torch.where(unseen[:, None, None], original, final.sh[: len(kept)])
     rest = np.setdiff1d(np.flatnonzero(~np.isin(gmap.instance_ids, gone)), visit.rows)  # no photo may show these
-    whole = Gaussians.concatenate([gaussians_of(gmap, rest), final])
+    together = Gaussians.concatenate([gaussians_of(gmap, rest), final])
     names, members, owned = [gmap.instance_ids[rest], *names], [gmap.membership[rest], *members], [parts[rest], *owned]
     arrays = (np.concatenate(names).astype(np.int32), np.concatenate(members), np.concatenate(owned).astype(np.int32))
     motions = {i: motion for i, (_, motion) in pairs.items()}
     record = TrainRecord.joined([record, last])
-    return Today(whole, np.concatenate([rest, kept]), *arrays, signs, gone, motions, added, record)
+    return Today(together, np.concatenate([rest, kept]), *arrays, signs, gone, motions, added, record)

@@ -141,9 +141,10 @@ def assembled(visit: Visit, today: Today, described: DescribedInstances, output:
             entry = with_parts(with_geometry(entry, gaussians, rows), gaussians, today.part_ids)
         instances.append(entry)
     for i, entry in zip(today.added, described.instances, strict=True):
-        known = today.added[i][1]
-        seen = {"first_seen": 0 if known else number, "last_seen": number, "last_looked_for": number}
-        state = {"state": "unchanged" if known else "added", "confidence": round(entry["score"], 3)}
+        new = today.added[i][1]
+        seen = {"first_seen": 0 if new == "known" else number, "last_seen": number, "last_looked_for": number}
+        seen |= {"hidden_before": True} if new == "hidden" else {}
+        state = {"state": "added" if new == "added" else "unchanged", "confidence": round(entry["score"], 3)}
         instances.append({**entry, "id": i, **state, **seen})
     with run.stage("score"):
         quality = score_views(in_grey(gaussians) if visit.grey else gaussians, visit.photos.held, gmap.metric)

@@ -13,7 +13,7 @@ from perception.cli import main
 from perception.edit.editor import Editor
 from perception.edit.scale import scaled
 from perception.errors import InputError
-from perception.map.history import Visit, change_in, changes_of, date_of, visits_of
+from perception.map.history import Visit, change_in, changes_of, date_of, joined_record, visits_of
 from perception.map.map import Map
 from perception.map.write import read_map, write_map
 from perception.query import QueryMap, load_map
@@ -248,3 +248,19 @@ def test_exports_hold_what_stands_there_today(path: Path, tmp_path: Path) -> Non
     gmap.groups = {"of": np.int32([0 if name == "mug" else -1 for name in NAMES]), "scores": np.float32([0.5])}
     write_map(tmp_path / "a.gsmap", gmap)
     assert main(["export", str(tmp_path / "a.gsmap"), "-o", str(out), "--granularity", "groups"]) == 2
+
+
+def test_what_no_earlier_photo_could_see_is_not_known_to_have_come(path: Path) -> None:
+    """A lamp that visit 1 found where none looked before: unchanged until it moves, and added without that record."""
+    gmap = read_map(path)
+    visits = visits_of(gmap.info)
+    lamp = next(dict(entry) for entry in gmap.instances if entry["id"] == number("lamp"))
+    lamp = {key: value for key, value in lamp.items() if key != "past"} | {"first_seen": 1, "state": "unchanged"}
+    hidden = {**lamp, "hidden_before": True}
+    states = [[c["state"] for c in changes_of(visits, [lamp, hidden], start)] for start in (0, 1)]
+    assert states == [["added", "unchanged"], ["unchanged", "unchanged"]]
+    spot = {key: lamp[key] for key in ("centroid", "obb")} | {"until": 1, "transform": np.eye(4).tolist()}
+    (change,) = changes_of(visits, [{**hidden, "state": "moved", "past": [spot]}], 0)
+    assert change["state"] == "moved" and change["old_centroid"] == lamp["centroid"]
+    assert joined_record([hidden, hidden])["hidden_before"] is True
+    assert "hidden_before" not in joined_record([hidden, lamp])

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from perception.gaussians.model import from_points
+from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.views import TrainingView
-from perception.visits.evidence import signs_of
+from perception.types import View
+from perception.visits.evidence import in_free_space, looked_at, signs_of
 from perception.visits.look import Look, in_view
 from perception.visits.record import with_parts
 
@@ -106,3 +108,38 @@ def test_parts_of_a_thing_that_moved_lie_where_it_stands() -> None:
         assert np.allclose(part["centroid"], own.mean(axis=0), atol=1e-3) and part["num_gaussians"] == 20
         assert np.allclose(part["aabb"]["min"], own.min(axis=0), atol=0.02)
     assert with_parts({"id": 4}, gaussians, part_ids) == {"id": 4}
+
+
+def test_a_place_was_looked_at_where_two_views_saw_it_before_the_wall() -> None:
+    """A wall at z = 2 up to y = 0.5 before cameras that look along z; exact sight lines."""
+    x, y = torch.meshgrid(torch.linspace(-1, 1, 81), torch.linspace(-0.5, 0.5, 41), indexing="ij")
+    grid = torch.stack([x, y, torch.full_like(x, 2.0)], dim=2).reshape(-1, 3)
+    n = len(grid)
+    wall = Gaussians(
+        means=grid,
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        log_scales=torch.tensor([[0.02, 0.02, 0.002]]).log().repeat(n, 1),
+        opacity_logits=torch.full((n,), 6.0),
+        sh=torch.zeros(n, 16, 3),
+        features=torch.zeros(n, 2),
+    )
+    K = np.array([[300.0, 0, 160], [0, 300.0, 120], [0, 0, 1]])
+    views = [View(str(x), Path(), K, 320, 240, np.eye(4) - np.eye(4, k=3) * x) for x in (-0.2, 0.2)]
+    points = np.array(
+        [[0, 0, 1.0], [0.3, 0.2, 1.99], [0, 0, 2.5], [5, 0, 1.0], [0, 0, -1.0], [0.6, 0, 1.0], [0, 2, 6.0]]
+    )
+    # Of the last but one only the second view is near enough, |x - 0.2| < z 160 / 300; the last is seen past the wall.
+    assert looked_at(wall, views, points).tolist() == [True, True, False, False, False, False, True]
+    assert not looked_at(wall, views[:1], points).any()
+
+
+def test_what_two_photos_see_through_is_free_space() -> None:
+    """Points on the axis of the photos, whose measured depth is 3: before it, within its noise, behind it; not in the
+    picture; and where nothing was measured."""
+    look = shown(3.0)
+    points = np.array([[0, 0, 2.0], [0, 0, 2.95], [0, 0, 3.5], [-90, 0, 2.0]])
+    view = replace(look.view, K=torch.tensor([[1.0, 0, 20], [0, 1, 20], [0, 0, 1]]))
+    looks = [replace(look, view=view)] * 2
+    assert in_free_space(looks, points).tolist() == [True, False, False, False]
+    assert not in_free_space(looks[:1], points).any()
+    assert not in_free_space([replace(each, measured=np.zeros(SHAPE)) for each in looks], points).any()
