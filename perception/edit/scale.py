@@ -51,12 +51,15 @@ def scale_map(path: Path, output: Path | None, options: FrameConfig, improve: bo
 
 
 def scaled(gmap: Map, factor: float) -> Map:
-    """The map with all lengths times `factor`: Gaussians, instances with their history, parts and views.
+    """The map with all lengths times `factor`: Gaussians, instances with their history, parts, views, errors of depth.
     map.json's map_from_input is continued if the input had poses."""
     b_from_a = np.diag([factor, factor, factor, 1.0])
     info = dict(gmap.info)
     if "map_from_input" in info or info.get("scene", {}).get("input") != "photos":
         info["map_from_input"] = (b_from_a @ map_from_input(gmap.path or Path("map"), info)).tolist()
+    if (depth := info.get("quality", {}).get("depth") or {}).get("unit") == "m":
+        lengths = {name: factor * depth[name] for name in ("median", "tolerance")}
+        info["quality"] = {**info["quality"], "depth": {**depth, **lengths}}
 
     def entry(old: dict[str, Any]) -> dict[str, Any]:
         new = {**old, "centroid": (factor * np.array(old["centroid"])).tolist()}

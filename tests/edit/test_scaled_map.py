@@ -15,6 +15,7 @@ from perception.frame.recentre import map_from_input
 from perception.gaussians.model import as_gaussians
 from perception.gaussians.views import render
 from perception.map.write import Map, read_map, write_map
+from perception.report.text import depth_text
 from support.viewer_maps import small_map
 
 
@@ -62,6 +63,14 @@ def test_a_scaled_map_shows_the_same_pictures() -> None:
     assert "map_from_input" not in moved.info  # of photos without poses
     given = scaled(Map.of(gmap, info={"scene": {"input": "colmap"}}), 3.0)
     np.testing.assert_allclose(map_from_input(Path("x"), given.info), np.diag([3, 3, 3, 1.0]))
+
+
+@pytest.mark.parametrize(("unit", "told"), [("m", "3.6 cm in the median, 90% within 15 cm"), ("relative", "1.2 %")])
+def test_errors_of_depth_are_scaled_where_they_are_lengths(unit: str, told: str) -> None:
+    depth = {"median": 0.012, "close": 0.9, "tolerance": 0.05, "unit": unit, "rendered": 1.0}
+    info = {**some_map().info, "quality": {"depth": depth, "views": {}}}
+    assert told in depth_text(scaled(Map.of(some_map(), info=info), 3.0).info["quality"]["depth"])
+    assert info["quality"]["depth"] == {**depth, "median": 0.012}
 
 
 def test_scale_by_two_instances_and_by_two_points(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
