@@ -64,7 +64,8 @@ class NewPhoto:
 class Localised:
     """A photo's pose: camera_from_map [4, 4] float64, OpenCV axes, in the map's frame and unit. lens: known, or as
     estimated. covariance [6, 6]: of the rotation vector about the map's axes (radians), then of the position. inliers:
-    features that agree with the pose; rms_px: their error in pixels. mask: of the pixels that were used."""
+    features that agree with the pose; rms_px: their error in pixels. mask: of the pixels that were used. depth: its
+    scale in the map's unit."""
 
     name: str
     photo: Path
@@ -74,6 +75,7 @@ class Localised:
     inliers: int
     rms_px: float
     mask: Path | None = None
+    depth: DepthImage | None = None
 
     @property
     def position(self) -> np.ndarray:
@@ -219,6 +221,7 @@ class _Search:
         if not 1 / OTHER_UNIT < ratio < OTHER_UNIT:
             scaled = replace(self.new.features, depth=self.new.features.depth * max(ratio, 0.0))
             self.new = replace(self.new, features=scaled)
+            self.photos = [replace(photo, depth=_in_unit(photo.depth, ratio)) for photo in self.photos]
 
     def _alone(self, number: int) -> np.ndarray:
         """Places a photo by the map's photos alone; its matches [M, 2] with features of the map that have a point."""
@@ -285,7 +288,12 @@ class _Search:
             return NotHere(photo.name, photo.photo, f"not in this map: {self.why[number]}")
         lens, pose = view_lens(self.views[number]), self.placed[number]
         figures = found.covariance[number], found.inliers[number], found.rms[number]
-        return Localised(photo.name, photo.photo, lens, pose, *figures, photo.mask)
+        return Localised(photo.name, photo.photo, lens, pose, *figures, photo.mask, photo.depth)
+
+
+def _in_unit(depth: DepthImage | None, factor: float) -> DepthImage | None:
+    """A depth image in another unit, `factor` of which are one of its own; None without a unit that it can have."""
+    return None if depth is None or factor <= 0 else replace(depth, scale=factor * depth.scale)
 
 
 def _view(photo: NewPhoto, lens: Lens) -> View:

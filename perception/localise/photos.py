@@ -41,7 +41,7 @@ def new_photos(sources: Sequence[Path], camera: Path | None, workdir: Path, prog
         elif (reader := reader_of(source)).poses:
             options = ReadOptions(workdir, progress=progress, poses="keep", cloud=NO_POINTS, lens=lens)
             views = reader.read(source, options).views
-            found += [NewPhoto(view.name, view.photo, view_lens(view), view.depth) for view in views]
+            found += [NewPhoto(v.name, v.photo, view_lens(v), v.depth, v.mask, v.as_stored) for v in views]
         elif photos := list_photos(source):
             found += [NewPhoto(view_name(photo, source), photo) for photo in photos]
         else:
@@ -60,9 +60,9 @@ def _fitted(lens: Lens, photo: Path, camera: Path | None) -> Lens:
     raise InputError(f"{photo}: the photo is {found}, the camera file {camera} says {lens.width}×{lens.height}")
 
 
-def transforms_of(found: Sequence[Localised], depths: dict[str, Any], output: Path, facts: dict[str, Any]) -> Any:
+def transforms_of(found: Sequence[Localised], output: Path, facts: dict[str, Any]) -> Any:
     """The transforms.json of poses in the map's frame, as nerfstudio reads it (OpenGL camera axes), for a file at
-    `output`; paths are relative to it. depths: DepthImage by name. facts: entries of the file itself."""
+    `output`; paths are relative to it. facts: entries of the file itself."""
     frames = []
     for each in found:
         frame = {
@@ -70,7 +70,7 @@ def transforms_of(found: Sequence[Localised], depths: dict[str, Any], output: Pa
             "transform_matrix": (inverse_se3(each.camera_from_map) @ OPENCV_FROM_OPENGL).tolist(),
             **lens_values(each.lens),
         }
-        depth = depths.get(each.name)
+        depth = each.depth
         if depth is not None and depth.lens is None:
             frame |= {"depth_file_path": _beside(depth.path, output), "depth_unit_scale_factor": depth.scale}
         frames.append(frame)

@@ -38,9 +38,8 @@ def localise_photos(
     facts |= {"map_id": gmap.map_id, "rendered": localiser.rendered}
     found = [answer for answer in answers if isinstance(answer, Localised)]
     if output is not None and found:
-        depths = {photo.name: photo.depth for photo in new}
         head = {"map_id": gmap.map_id, "frame": gmap.frame, **unit_of(gmap.info)}
-        write_file(output, json.dumps(transforms_of(found, depths, output, head), indent=1) + "\n")
+        write_file(output, json.dumps(transforms_of(found, output, head), indent=1) + "\n")
     return facts, _lines(answers, gmap, localiser.rendered)
 
 

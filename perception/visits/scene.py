@@ -134,8 +134,7 @@ def _localised(run: Run, gmap: Map, source: Path, options: ReadOptions) -> Scene
         many = f"{len(answers) - len(here)} of {len(answers)} photos are not in {gmap.path} ({first})"
         raise InputError(f"{run.source}: {many}; give photos of the mapped scene, or map this one anew")
     views = [make_view(a.name, a.photo, a.lens, a.camera_from_map, a.photo) for a in here]
-    depths = {photo.name: photo.depth for photo in found}
-    views = [replace(v, depth=depths[v.name], mask=answer.mask) for v, answer in zip(views, here, strict=True)]
+    views = [replace(view, mask=answer.mask) for view, answer in zip(views, here, strict=True)]
     left = [{"name": a.name, "why": a.why} for a in answers if not isinstance(a, Localised)]
     report = {"input": "photos", "left_out": left}
     none = np.zeros((0, 3))

@@ -12,17 +12,20 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 import perception
 from perception.cli import main
 from perception.errors import InputError
 from perception.inputs.transforms import in_map_frame, lens_values, read_frames, unit_of
+from perception.localise.photos import new_photos
 from perception.map.files import MapFiles
 from perception.map.map import Map
 from perception.map.write import read_map, write_map
 from perception.photos.lens import camera_from_lens
+from perception.progress import QUIET
 from perception.types import Lens
-from support.painted_room import PaintedRoom, difference, walk, write_room_map
+from support.painted_room import FOCAL, PaintedRoom, difference, walk, write_room_map
 
 TRUTH = walk(1, 4, 0.15)[1:3]
 LENS = Lens("PINHOLE", (150.0, 150.0, 100.0, 75.0), 200, 150)
@@ -57,6 +60,22 @@ def test_poses_as_json_and_as_a_file_in_the_maps_frame(folder: Path, capsys: pyt
         assert np.allclose(pose, photo["camera_from_map"]) and lens.params[0] == 300
         assert difference(pose, truth)[0] < 0.003
         assert np.allclose(photo["position"], np.linalg.inv(truth)[:3, 3], atol=0.003)
+
+
+def test_a_posed_photo_is_used_as_its_poses_mean_it(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not turned by EXIF, as its lens is of the pixels as stored, and with its mask."""
+    turned = Image.Exif()
+    turned[0x0112] = 6
+    Image.open(folder / "new/0.png").save(tmp_path / "0.png", exif=turned)
+    cv2.imwrite(str(tmp_path / "mask.png"), np.full((300, 400), 255, np.uint8))
+    frame = {"file_path": "0.png", "mask_path": "mask.png", "transform_matrix": np.eye(4).tolist()}
+    lens = lens_values(Lens("PINHOLE", (FOCAL, FOCAL, 200.0, 150.0), 400, 300))
+    (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": [frame]}))
+    photo = told(capsys, folder / "a.gsmap", tmp_path)["photos"][0]
+    assert difference(np.array(photo["camera_from_map"]), TRUTH[0])[0] < 0.003
+    assert new_photos([tmp_path], None, tmp_path, QUIET)[0].mask == tmp_path / "mask.png"
 
 
 @pytest.mark.slow

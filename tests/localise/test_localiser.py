@@ -126,6 +126,7 @@ def test_measured_depth_makes_a_pose_surer_in_any_unit(room: PaintedRoom, known:
         answer = known.answers([replace(photo, depth=DepthImage(tmp_path / "depth.png", scale))])[0]
         assert isinstance(answer, Localised)
         assert answer.standard_error[0] < plain.standard_error[0]
+        assert answer.depth is not None and answer.depth.scale == pytest.approx(1e-3, rel=0.01)  # the image has mm
         assert difference(answer.camera_from_map, truth)[0] < NEAR[0]
 
 
