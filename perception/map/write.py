@@ -135,7 +135,7 @@ def relink(path: Path, folder: Path) -> dict[str, Any]:
     """Records for every view of the map at `path` the photo below `folder` with the same name and size.
 
     A photo is searched by the view name ("a/0001.jpg"), that among the photos of its visit, else by the file name alone
-    if that is unique below `folder`; capitals and small letters are the same.
+    if that is unique among files of its size below `folder`; capitals and small letters are the same.
     Views without such a photo keep their record. Returns {"linked": count, "missing": names, "differ": names of
     photos of another size}. InputError when no photo is found, or while the map is locked by another writer.
     """
@@ -149,15 +149,16 @@ def relink(path: Path, folder: Path) -> dict[str, Any]:
         files = MapFiles(path)
         entries, linked, missing, differ = [], 0, [], []
         for entry, view in zip(files.facts.get("views", []), files.read("views"), strict=True):
-            alike = by_name[folded(PurePosixPath(view.name).name)]
-            found = next(filter(None, map(named.find, (view.name, view.photo_name))), None)
-            found = found or (alike[0] if len(alike) == 1 and alike[0].is_file() else None)
-            if found is None:
-                missing.append(view.name)
-            elif view.photo_bytes not in (None, found.stat().st_size):
+            alike = [file for file in by_name[folded(PurePosixPath(view.name).name)] if file.is_file()]
+            exact = [file for file in map(named.find, (view.name, view.photo_name)) if file is not None]
+            of_size = [[f for f in some if view.photo_bytes in (None, f.stat().st_size)] for some in (exact, alike)]
+            if not any(of_size) and (exact or alike):
                 differ.append(view.name)
+            elif not of_size[0] and len(of_size[1]) != 1:
+                missing.append(view.name)
             else:
                 linked += 1
+                found = (of_size[0] or of_size[1])[0]
                 record = view_json(stored_view(view_from_json({**entry, "photo": str(found)}), path))
                 entry = {**entry, **{key: record[key] for key in ("photo", "photo_beside", "photo_bytes")}}
             entries.append(entry)

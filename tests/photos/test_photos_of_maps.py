@@ -119,6 +119,26 @@ def test_relink_finds_the_photos_of_a_later_visit_in_its_folders(path: Path) -> 
     assert found == [moved / "left" / "1.png", moved / "right" / "1.png"]
 
 
+def test_relink_finds_the_photos_of_all_visits_below_one_folder(path: Path) -> None:
+    """The visits have the same file names, so that sizes tell their photos apart; of two of one size none is taken."""
+    gmap, disk = read_map(path), path.parents[1] / "disk"
+    for visit, width in ((1, 200), (2, 400)):
+        photo = disk / f"visit{visit}" / "images" / "00000.png"
+        photo_of(photo, BLUE, width)
+        view = View("00000.png", photo, np.eye(3), width, 48, np.eye(4))
+        gmap.views.append(replace(stored_view(view, path, visit=visit), name=f"visit{visit}/{view.name}"))
+    gmap.info["visits"] = [{"time": None, "input": str(n), "photos": 1} for n in range(3)]
+    write_map(path, gmap)
+    (path.parent / "photos").rename(disk / "first")
+    disk.rename(moved := disk.with_name("moved"))
+    assert relink(path, moved) == {"linked": 3, "missing": [], "differ": []}
+    places = ("first/s", "visit1/images", "visit2/images")
+    assert [view.photo for view in read_map(path).located_views()] == [moved / p / "00000.png" for p in places]
+    (moved / "first").rename(moved / "again")
+    shutil.copytree(moved / "again", moved / "twice")
+    assert relink(path, moved) == {"linked": 2, "missing": ["s/00000.png"], "differ": []}
+
+
 def test_relink_refuses_a_folder_without_the_photos(path: Path) -> None:
     before = (path / "map.json").read_bytes()
     other = path.parents[1] / "other"
