@@ -6,6 +6,7 @@ Values that users have no reason to change are named constants in the module tha
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import NoneType
@@ -37,6 +38,21 @@ class Settings(BaseModel):
         return value
 
 
+def absolute_paths(value: str | None) -> str | None:
+    """A setting that names files, as PATH, KIND:PATH or KIND:PATH,PATH: what exists as absolute paths, so that it means
+    the same files in another folder; all else, such as the name of a stored model, as it is.
+
+    >>> absolute_paths("sam:mobilesam")
+    'sam:mobilesam'
+    """
+    if value is None:
+        return None
+    kind, colon, named = value.partition(":") if value.startswith(("labels:", "sam:", "clip:")) else ("", "", value)
+    exists = os.path.exists  # Path.exists raises for a name that is too long
+    parts = [named] if exists(named) else named.split(",")
+    return kind + colon + ",".join(str(Path(p.strip()).absolute()) if exists(p.strip()) else p for p in parts)
+
+
 class PhotoConfig(Settings):
     max_side: int = Field(800, ge=16, le=65536, description="pixels of the long side at which the map is trained")
     holdout: int = Field(
@@ -56,6 +72,7 @@ class PhotoConfig(Settings):
         "auto", description="given poses: refined where matched features show that they are wrong, kept, or refined"
     )
     strict: bool = Field(False, description="refuse a damaged photo instead of leaving it out")
+    _absolute = field_validator("held_out", "camera", "ignore_masks", "init_points")(absolute_paths)
     memory: str | None = Field(
         None,
         pattern=r"^[1-9][0-9]*[MG]$",
@@ -78,6 +95,7 @@ class SplatConfig(Settings):
     cameras: str | None = Field(None, description="of a finished splat: COLMAP model or transforms.json, used first")
     up: str | None = Field(None, description="of a finished splat: z, -y, ... or X,Y,Z; none: as its floor lies")
     unit: str | None = Field(None, pattern="^metre$", title="metre", description="of a finished splat, if known")
+    _absolute = field_validator("cameras")(absolute_paths)
 
 
 class SamConfig(Settings):
@@ -153,6 +171,7 @@ class LanguageConfig(Settings):
     texts: Literal["auto", "on", "off"] = Field(
         "auto", description="reading of printed texts; auto: if the extra ocr is installed"
     )
+    _absolute = field_validator("encoder")(absolute_paths)
 
 
 class MapConfig(Settings):
@@ -176,6 +195,7 @@ class MapConfig(Settings):
     losses: LossConfig = LossConfig()
     instances: InstanceConfig = InstanceConfig()
     language: LanguageConfig = LanguageConfig()
+    _absolute = field_validator("masks")(absolute_paths)
 
     def to_json(self) -> dict[str, Any]:
         """All settings as nested dicts, as `config` of map.json."""

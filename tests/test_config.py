@@ -27,6 +27,20 @@ def test_pairs_override_file_overrides_preset(tmp_path: Path) -> None:
     assert config.train.exchange_db == 0.1 and config.densify == load_config().densify
 
 
+def test_files_are_the_same_from_another_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A map tells its encoder and masks to programs that run elsewhere."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("labels, 1", "a.onnx", "b.onnx", "cam.yaml"):
+        (tmp_path / name).touch()
+    given = {"masks": "labels:labels, 1", "language.encoder": "clip:a.onnx, b.onnx", "photos.camera": "cam.yaml"}
+    given |= {"photos.held_out": "no, such.txt", "splat.cameras": "none"}
+    config = load_config(pairs=[f"{key}={value}" for key, value in given.items()])
+    assert config.masks == f"labels:{tmp_path}/labels, 1" and config.photos.camera == f"{tmp_path}/cam.yaml"
+    assert config.language.encoder == f"clip:{tmp_path}/a.onnx,{tmp_path}/b.onnx"
+    assert config.photos.held_out == "no, such.txt" and config.splat.cameras is None
+    assert load_config(pairs=["masks=sam:mobilesam"]).masks == "sam:mobilesam"
+
+
 def test_the_papers_preset_is_the_published_method() -> None:
     """Every setting of the method, spelt out: a changed default must not change what `paper` means."""
     config = load_config(None, [], "paper")

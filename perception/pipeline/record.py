@@ -42,7 +42,7 @@ def run_record(
         "frame": scene.frame,
         "metric": scene.metric,
         **{key: scene.report[key] for key in FRAME_FACTS if key in scene.report},
-        "source": str(run.source),
+        "source": str(run.source.absolute()),
         "seed": run.config.seed,
         "fingerprint": fingerprint(run.source, run.config),
         "config": run.config.to_json(),

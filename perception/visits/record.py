@@ -49,7 +49,7 @@ def visit_record(source: Path, photos: Sequence[Path]) -> dict[str, Any]:
     if taken is None and photos:
         taken = datetime.fromtimestamp(max(photo.stat().st_mtime for photo in photos), timezone.utc)
     time = None if taken is None else taken.strftime("%Y-%m-%dT%H:%M:%SZ")
-    return {"time": time, "input": str(source), "photos": len(photos)}
+    return {"time": time, "input": str(source.absolute()), "photos": len(photos)}
 
 
 def visits_with(gmap: Map, source: Path, photos: Sequence[Path]) -> list[dict[str, Any]]:

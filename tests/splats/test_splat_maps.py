@@ -28,7 +28,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, np.ndarr
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cameras, "MOST_VIEWS", 24)
         patch.setattr(panoramas, "PLACES", 120)
-        assert main(["map", str(source), "-o", str(output), *OPTIONS, "--set", "train.iterations=300"]) == 0
+        patch.chdir(folder)  # and the map is exported elsewhere
+        assert main(["map", source.name, "-o", str(output), *OPTIONS, "--set", "train.iterations=300"]) == 0
     return source, output, thing
 
 
