@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import shlex
 from pathlib import Path
 from unicodedata import category
 
@@ -26,6 +27,11 @@ class InputError(ValueError):
     def __init__(self, message: object = ""):
         hidden = ("Cc", "Cs", "Zl", "Zp")
         super().__init__("".join(ascii(c)[1:-1] if category(c) in hidden else c for c in str(message)))
+
+
+def shell_word(path: Path | str) -> str:
+    """A path in a command that people copy: one word of a shell, and no option."""
+    return shlex.quote(f"./{path}" if str(path).startswith("-") else str(path))
 
 
 def missing_extra(package: str, extra: str) -> InputError:

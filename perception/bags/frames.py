@@ -16,7 +16,7 @@ from perception.bags.cameras import image_camera
 from perception.bags.depth import MILLIMETRES, choose_depth, depth_topics, write_depth
 from perception.bags.poses import FIXED_FRAMES, Poses, gravity, read_poses
 from perception.bags.read import IMAGES, Bag, decode_image, encoded, frame_of, open_bag, stamp_of
-from perception.errors import InputError
+from perception.errors import InputError, shell_word
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
 from perception.inputs.transforms import lens_values
 from perception.io.atomic import atomic_directory
@@ -188,5 +188,6 @@ def _text(facts: dict[str, Any]) -> str:
     if facts["gravity"]:
         line += f"\ngravity: {facts['gravity_source']}, ±{facts['gravity_std_deg']:.1f}°"
     if facts["with_pose"]:
-        return f"{line}\nnext: perception map {folder} -o MAP"
-    return f"{line}\nno poses\nnext: perception map {folder}/images --camera {folder}/camera.yaml -o MAP"
+        return f"{line}\nnext: perception map {shell_word(folder)} -o MAP"
+    images, camera = (shell_word(f"{folder}/{name}") for name in ("images", "camera.yaml"))
+    return f"{line}\nno poses\nnext: perception map {images} --camera {camera} -o MAP"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from perception.errors import shell_word
 from perception.map.checksums import IGNORED
 from perception.map.history import STATES, Visit, changes_of, date_of, is_removed, visits_of
 
@@ -68,9 +69,8 @@ def info_text(path: Path, info: dict[str, Any], entries: Sequence[dict[str, Any]
     if visits := info.get("visits"):
         dates, newest = visits_of(info), len(visits) - 1
         states = state_counts(changes_of(dates, list(entries), max(newest - 1, 0)))
-        lines.append(
-            f"visits: {len(visits)}, the newest on {date_of(dates, newest)} ({states}); perception changes {path}"
-        )
+        more = f"perception changes {shell_word(path)}"
+        lines.append(f"visits: {len(visits)}, the newest on {date_of(dates, newest)} ({states}); {more}")
     if training.get("profile"):
         lines.append("of training: " + ", ".join(f"{name} {share:.0%}" for name, share in shares(training).items()))
     if depth := info.get("depth"):
@@ -101,9 +101,10 @@ def _next_step(path: Path, info: dict[str, Any]) -> str:
     """The command that helps most."""
     if not info["num_instances"]:
         return "no instance was found; give masks (perception map --masks) or more photos"
+    name = shell_word(path)
     if not info.get("metric"):
-        return f'perception scale {path} --known-length "METRES: ID, ID" for metres; perception query {path} "mug"'
-    return f'perception query {path} "mug", or perception view {path}'
+        return f'perception scale {name} --known-length "METRES: ID, ID" for metres; perception query {name} "mug"'
+    return f'perception query {name} "mug", or perception view {name}'
 
 
 def frame_lines(info: dict[str, Any]) -> list[str]:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
+from perception.cli import build_parser
 from perception.query import Hit
 from perception.report.page import _left_out
 from perception.report.text import info_text, query_text
@@ -55,3 +58,11 @@ def test_the_first_three_lines_of_info_are_what_how_good_and_what_next() -> None
     assert how_good == "quality: poor: PSNR 18.20 dB, SSIM 0.610, held-out photos: 1, photos left out: 1, warnings: 1"
     assert after.startswith("next: perception query k.gsmap")
     assert "perception scale" in info_text(Path("k.gsmap"), {**info, "metric": False}).splitlines()[2]
+
+
+@pytest.mark.parametrize("name", ["k.gsmap", "my kitchen's.gsmap", "-k.gsmap"])
+def test_the_next_command_can_be_copied_for_any_name(name: str) -> None:
+    info = {"num_gaussians": 9, "num_instances": 6, "sh_degree": 1, "metric": True, "views": []}
+    line = info_text(Path(name), info).splitlines()[2].removeprefix("next: ").partition(", or")[0]
+    args = build_parser().parse_args(shlex.split(line)[1:])
+    assert (args.command, args.map, args.text) == ("query", Path(name), ["mug"])
