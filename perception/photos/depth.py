@@ -37,7 +37,8 @@ def read_depth(path: Path) -> np.ndarray:
 def measured(image: np.ndarray) -> np.ndarray:
     """A depth image as float32, 0 where nothing was measured (0, negative, NaN, infinite, saturated)."""
     depth = image.astype(np.float32)
-    depth[~np.isfinite(depth) | (depth < 0) | ((image == SATURATED) & (image.dtype == np.uint16))] = 0
+    unknown = ~np.isfinite(depth) | (depth < 0)
+    depth[unknown | (image == SATURATED) if image.dtype == np.uint16 else unknown] = 0
     return depth
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -69,9 +70,11 @@ def test_pixels_without_depth_stay_without(tmp_path):
     found = load_depth(_view(PINHOLE, tmp_path, image), 64, 48)
     assert (found[:20] == 0).all()
     assert (found[20:] > 0).all()
-    values = np.array([[np.nan, np.inf, -1.0, 0.0, 1.5]], np.float32)
-    np.save(tmp_path / "d.npy", values)
-    assert read_depth(tmp_path / "d.npy").tolist() == [[0, 0, 0, 0, 1.5]]
+    for kind in (np.float16, np.float32, np.float64):
+        np.save(tmp_path / "d.npy", np.array([[np.nan, np.inf, -1.0, 0.0, 1.5]], kind))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert read_depth(tmp_path / "d.npy").tolist() == [[0, 0, 0, 0, 1.5]]
 
 
 @pytest.mark.parametrize(
