@@ -121,7 +121,9 @@ class TrainConfig(Settings):
         le=1000,
         description="dB of held-out PSNR that 10 % more time must gain, else training ends; 0: never",
     )
-    budget: int = Field(0, ge=0, le=10**8, description="most Gaussians the map may have; 0: 100,000, or 2,300 a photo")
+    budget: int = Field(
+        0, ge=0, le=10**8, description="most Gaussians of the map, or of each block; 0: 100,000, or 2,300 a photo"
+    )
     block_photos: int = Field(
         400, ge=0, le=10**6, description="a scene of more photos is trained in overlapping blocks; 0: never"
     )
@@ -196,6 +198,11 @@ class MapConfig(Settings):
     instances: InstanceConfig = InstanceConfig()
     language: LanguageConfig = LanguageConfig()
     _absolute = field_validator("masks")(absolute_paths)
+
+    def part(self, share: float) -> MapConfig:
+        """The settings of one of several trainings of a run, which has `share` of the time limit if there is one."""
+        limit = self.train.time_limit and share * self.train.time_limit
+        return self.model_copy(update={"train": self.train.model_copy(update={"time_limit": limit})})
 
     def to_json(self) -> dict[str, Any]:
         """All settings as nested dicts, as `config` of map.json."""

@@ -110,7 +110,7 @@ _SHORTCUTS = {
     "splat.up": ("AXIS", "of a finished splat: z, -y, ... or X,Y,Z"),
     "splat.unit": ("UNIT", "of a finished splat: metre"),
     "photos.max_side": ("PX", "long side in pixels at which the map is trained"),
-    "train.budget": ("N", "most Gaussians the map may have"),
+    "train.budget": ("N", "most Gaussians of the map, or of each block"),
     "train.iterations": ("N", None),
     "train.time_limit": ("S", "seconds of training; all schedules shrink to fit"),
     "photos.memory": (

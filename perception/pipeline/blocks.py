@@ -151,7 +151,10 @@ def optimise_blocks(
     """
     label_by_tasks(run, training, source)
     held = {view.name for view in held_out}
-    folders = [_task(run, scene, block, held, source.needs_depth) for block in blocks]
+    total = sum(len(block.views) for block in blocks)
+    configs = [run.config.part(len(block.views) / total) for block in blocks]
+    each = zip(blocks, configs, strict=True)
+    folders = [_task(run, scene, block, config, held, source.needs_depth) for block, config in each]
     with run.stage("train"):
         run.engine.run(optimise_block, [str(folder.resolve()) for folder in folders], "block", run.progress)
     parts, records, reports = [], [], []
@@ -201,7 +204,7 @@ def joined(parts: Sequence[Gaussians]) -> Gaussians:
     return Gaussians.concatenate(padded)
 
 
-def _task(run: Run, scene: Scene, block: Block, held: set[str], own_masks: bool) -> Path:
+def _task(run: Run, scene: Scene, block: Block, config: MapConfig, held: set[str], own_masks: bool) -> Path:
     """Writes the task of a block: the part of the scene that it is trained on, and the settings. Returns its folder."""
     views = [scene.views[i] for i in block.views]
     names = [view.name for view in views]
@@ -215,7 +218,7 @@ def _task(run: Run, scene: Scene, block: Block, held: set[str], own_masks: bool)
             folder,
             replace(scene, views=views, points=scene.points[seen], point_colors=scene.point_colors[seen]),
             source=str(run.source.resolve()),
-            config=sized(run.config, len(set(names) - held), largest_budget(memory_limit())).to_json(),  # the driver's
+            config=sized(config, len(set(names) - held), largest_budget(memory_limit())).to_json(),  # the driver's
             held_out=sorted(held & set(names)),
             box=box,
             masks=str((folder / "masks" if own_masks else run.masks).resolve()),

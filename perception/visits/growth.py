@@ -70,10 +70,10 @@ def new_surface(looks: Sequence[Look], like: Gaussians, budget: int, seed: int) 
 
 def update_config(config: MapConfig, photos: int, share: float, start: int) -> MapConfig:
     """The settings of one leg of training: `share` of the iterations of a new map, fewer for a few photos, as these see
-    little; at most `start` Gaussians."""
-    share *= min(1.0, photos / USUAL_PHOTOS)
+    little; at most `start` Gaussians, and its part of a time limit."""
+    part, share = share / (GROWING + SETTLING), share * min(1.0, photos / USUAL_PHOTOS)
     iterations = max(LEAST_ITERATIONS, round(share * sized(config, photos).train.iterations))
-    train = config.train.model_copy(update={"iterations": iterations, "budget": max(1, start)})
+    train = config.part(part).train.model_copy(update={"iterations": iterations, "budget": max(1, start)})
     return config.model_copy(update={"train": train})
 
 

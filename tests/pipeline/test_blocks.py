@@ -20,14 +20,16 @@ from perception.gaussians.model import from_points
 from perception.gaussians.stereo import visible_points
 from perception.geometry import camera_centres
 from perception.map.write import Map
+from perception.masks import make_source
 from perception.pipeline import blocks as module
 from perception.pipeline import photo_tasks
-from perception.pipeline.blocks import APART, Block, cut, joined, nearby_rows, optimise_block
+from perception.pipeline.blocks import APART, Block, cut, joined, nearby_rows, optimise_block, optimise_blocks
 from perception.pipeline.checkpoint import work_folder
 from perception.pipeline.mapping import build_map
 from perception.pipeline.optimise import Run
+from perception.progress import QUIET
 from perception.tasks.engine import Engine
-from perception.tasks.folder import TASK, versions, write_task
+from perception.tasks.folder import TASK, read_task, versions, write_task
 from perception.types import Scene, View
 from support.aimed import look_at
 from support.elsewhere import Elsewhere
@@ -137,6 +139,22 @@ def test_a_cut_holds_less_than_a_byte_for_each_photo_and_point() -> None:
         return most
 
     assert peak(300) - peak(100) < 200 * len(points)
+
+
+def test_blocks_share_the_time_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As they are trained one after the other; by their numbers of photos."""
+    scene, limits = corridor(), list[tuple[int, float]]()
+
+    def train(folder: str, progress: Any) -> None:
+        block, facts = read_task(Path(folder))
+        limits.append((len(block.views), facts["config"]["train"]["time_limit"]))
+
+    monkeypatch.setattr(module, "optimise_block", train)
+    run = Run.begun(tmp_path, load_config(pairs=["train.time_limit=60"]), tmp_path, QUIET)
+    with pytest.raises(InputError, match=r"has no result\.pt"):  # nothing was trained
+        optimise_blocks(cut(scene, 15), run, scene, scene.views, [], make_source("builtin"))
+    assert len(limits) >= 3 and sum(limit for _, limit in limits) == pytest.approx(60)
+    assert len({round(limit / photos, 6) for photos, limit in limits}) == 1
 
 
 def test_joined_gaussians_keep_their_order_harmonics_and_blocks() -> None:

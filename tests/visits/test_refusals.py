@@ -1,4 +1,4 @@
-"""What an update refuses before it changes anything: older photos, and depth in another unit."""
+"""What an update refuses before it changes anything: older photos, and depth in another unit; its settings."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from perception.config import MapConfig
+from perception.config import MapConfig, load_config
 from perception.errors import InputError
 from perception.gaussians.model import isotropic
 from perception.gaussians.views import TrainingView
@@ -19,6 +19,7 @@ from perception.map.write import read_map, set_labels, write_map
 from perception.pipeline.changes import inputs_of
 from perception.pipeline.checkpoint import digest, fingerprint
 from perception.visits.colours import without_colours
+from perception.visits.growth import GROWING, SETTLING, update_config
 from perception.visits.look import Look
 from perception.visits.record import visit_record
 from perception.visits.scene import foreign_photos, refuse_older, update_settings
@@ -90,6 +91,13 @@ def test_a_setting_without_effect_is_refused(tmp_path: Path) -> None:
         with pytest.raises(InputError, match="no effect on an update"):
             update_settings(path, None, ["seed=1", pair])
     assert update_settings(path, None, ["seed=1"]).seed == 1
+
+
+def test_both_trainings_of_an_update_share_the_time_limit() -> None:
+    config = load_config(pairs=["train.time_limit=60"])
+    limits = [update_config(config, 20, share, 1000).train.time_limit or 0 for share in (GROWING, SETTLING)]
+    assert sum(limits) == pytest.approx(60) and limits[0] / limits[1] == pytest.approx(GROWING / SETTLING)
+    assert update_config(load_config(), 20, GROWING, 1000).train.time_limit is None
 
 
 def test_a_finished_update_is_that_of_the_same_photos_and_the_same_map(tmp_path: Path) -> None:
