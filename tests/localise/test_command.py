@@ -26,6 +26,7 @@ from perception.photos.lens import camera_from_lens
 from perception.progress import QUIET
 from perception.types import Lens
 from support.painted_room import FOCAL, PaintedRoom, difference, walk, write_room_map
+from support.splat_rooms import room_columns, write_room
 
 TRUTH = walk(1, 4, 0.15)[1:3]
 LENS = Lens("PINHOLE", (150.0, 150.0, 100.0, 75.0), 200, 150)
@@ -117,6 +118,7 @@ def test_what_cannot_be_used_is_told_in_one_line(
     before = MapFiles(folder / "a.gsmap").map_id
     (tmp_path / "broken.png").write_bytes(b"no picture")
     (tmp_path / "video.mp4").write_bytes(b"")
+    write_room(tmp_path / "splat.ply", room_columns()[0])
     (tmp_path / "empty").mkdir()
     photo, poses = folder / "new/0.png", tmp_path / "posed" / "transforms.json"
     shutil.copytree(folder / "new", tmp_path / "posed")
@@ -128,6 +130,7 @@ def test_what_cannot_be_used_is_told_in_one_line(
         ([tmp_path / "nothing.png"], "no such file"),
         ([tmp_path / "video.mp4"], "is a video"),
         ([tmp_path / "empty"], "no photos found"),
+        ([tmp_path / "splat.ply"], "is a file; expected a folder of photos"),
         ([photo, "-o", photo], "write to another file"),
         ([photo, "-o", folder / "photos/0.png"], "write to another file"),
         ([tmp_path / "posed", "-o", poses], "write to another file"),
