@@ -62,8 +62,8 @@ def list_photos(folder: Path, suffixes: frozenset[str] = SUFFIXES) -> list[Path]
     followed; each real folder is listed once."""
     folder = Path(folder)
     if not folder.is_dir():
-        found = "is a file" if folder.exists() else "no such folder"
-        raise InputError(f"{folder}: {found}; expected a folder of photos")
+        what = "is a file" if folder.exists() else "no such folder"
+        raise InputError(f"{folder}: {what}; expected a folder of photos")
     found, seen, waiting = [], set(), [folder]
     while waiting:  # links last, so that a folder is listed under its own path
         waiting.sort(key=lambda path: (path.is_symlink(), path))
