@@ -23,8 +23,10 @@ from perception.geometry import check_similarity, move_points, scale_of
 from perception.io.atomic import write_file
 from perception.io.cloud import read_cloud, storable, write_cloud
 from perception.io.documents import refusing
+from perception.map.files import read_info
 from perception.map.history import is_removed
 from perception.map.write import Map, read_map
+from perception.photos.view_json import refuse_other_unit, unit_of
 from perception.types import PointCloud
 
 if TYPE_CHECKING:
@@ -80,14 +82,17 @@ def aligned(gmap: Map, scan: PointCloud, name: str) -> tuple[np.ndarray, dict[st
     return found.map_from_scan, {"verdict": "accepted", **{key: round(getattr(found, key), 6) for key in names}}
 
 
-def read_transform(path: Path) -> np.ndarray:
+def read_transform(path: Path, info: dict[str, Any]) -> np.ndarray:
     """map_from_scan [4, 4] float64: four rows of four numbers as text or JSON, or a JSON object that holds them as
-    `map_from_scan`, as `export` writes. InputError unless it is a rotation, a positive scale and a translation."""
+    `map_from_scan`, as `export` writes. InputError unless it is a rotation, a positive scale and a translation, and
+    where the map has another unit since `export` wrote it. info: of map.json."""
     with refusing(f"{path}: expected a 4 × 4 matrix as text or JSON ({{why}})"):
         text = path.read_text(encoding="utf-8-sig")
         if text.lstrip()[:1] in ("[", "{"):
             rows = json.loads(text)
-            rows = rows["map_from_scan"] if isinstance(rows, dict) else rows
+            if isinstance(rows, dict):
+                refuse_other_unit(path, rows.get("map_unit", {}), info, "align the scan again")
+                rows = rows["map_from_scan"]
         else:
             lines = (line.replace(",", " ").split() for line in text.splitlines())
             rows = [[float(number) for number in line] for line in lines if line]
@@ -121,7 +126,7 @@ def export_map(
 
     color: of the written points, "original" or "instance". pose: `points` lie in a frame of their own: True registers
     them (`export.align`), a path names a file with map_from_scan [4, 4]. The result keeps that frame; the sidecar and
-    the facts hold `map_from_scan`. granularity: see `at_granularity`.
+    the facts hold `map_from_scan` and `map_unit`. granularity: see `at_granularity`.
 
     InputError for a kind of file that is not written, and for a scan that does not overlap the map or is not aligned.
 
@@ -135,7 +140,7 @@ def export_map(
         raise InputError(f"{output}: unknown kind of cloud '{output.suffix}', expected one of {', '.join(SUFFIXES)}")
     if pose and points is None:
         raise InputError("--align and --transform need a scan; give it with --points")
-    known = None if isinstance(pose, bool) else read_transform(pose)
+    known = None if isinstance(pose, bool) else read_transform(pose, read_info(map_path))
     gmap = read_map(map_path)
     ids, instances = at_granularity(gmap, granularity)
     cloud = None if points is None else read_cloud(points)
@@ -148,7 +153,7 @@ def export_map(
     elif pose and cloud is not None:
         map_from_cloud, facts["alignment"] = aligned(gmap, cloud, str(points))
     if pose:
-        facts["map_from_scan"] = map_from_cloud.tolist()
+        facts |= {"map_from_scan": map_from_cloud.tolist(), "map_unit": unit_of(gmap.info)}
     moved = not np.array_equal(map_from_cloud, np.eye(4))
     means = move_points(np.linalg.inv(map_from_cloud), gmap.means.astype(np.float64)) if moved else gmap.means
     began = time.perf_counter()

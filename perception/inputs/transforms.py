@@ -20,7 +20,7 @@ from perception.photos.decode import SUFFIXES, photo_size, why_left_out
 from perception.photos.ignore_masks import mask_of
 from perception.photos.lens import FISHEYE, PERSPECTIVE, camera_from_lens, opencv_lens
 from perception.photos.named_files import NamedFiles
-from perception.photos.view_json import absolute
+from perception.photos.view_json import absolute, refuse_other_unit
 from perception.photos.views import first_of, posed_view, rigid_pose, without_far
 from perception.sfm.options import NO_CLOUD, ReadOptions
 from perception.sfm.triangulate import posed_scene
@@ -128,14 +128,8 @@ def in_map_frame(file: Path, info: dict[str, Any]) -> bool:
     data = read_json(file)
     if not isinstance(data, dict) or "map_id" not in data:
         return False
-    if any(key in data and data[key] != value for key, value in unit_of(info).items()):
-        raise InputError(f"{file}: its poses are in another unit than the map has now; run perception localise again")
+    refuse_other_unit(file, data, info, "run perception localise again")
     return True
-
-
-def unit_of(info: dict[str, Any]) -> dict[str, Any]:
-    """What `in_map_frame` compares: what map.json tells of the unit."""
-    return {"metric": info.get("metric", False), "scale": info.get("scale")}
 
 
 def lens_values(lens: Lens) -> dict[str, Any]:

@@ -10,12 +10,12 @@ from typing import Any
 
 from perception.errors import InputError
 from perception.inputs.load import input_files
-from perception.inputs.transforms import unit_of
 from perception.io.atomic import write_file
 from perception.localise.localiser import Localised, Localiser, NotHere
 from perception.localise.photos import new_photos, transforms_of
 from perception.map.map import Map
 from perception.map.outputs import refuse_inputs
+from perception.photos.view_json import unit_of
 from perception.progress import Progress
 
 

@@ -174,3 +174,14 @@ def _lens_json(lens: Lens | None) -> list[Any] | None:
 
 def _lens_of(entry: list[Any] | None) -> Lens | None:
     return None if entry is None else Lens(entry[0], tuple(map(float, entry[1])), *entry[2:])
+
+
+def refuse_other_unit(file: Path, data: dict[str, Any], info: dict[str, Any], todo: str) -> None:
+    """InputError where `data` in a file have `unit_of` a map that has had another unit since. info: of its map.json."""
+    if any(key in data and data[key] != value for key, value in unit_of(info).items()):
+        raise InputError(f"{file}: is in another unit than the map has now; {todo}")
+
+
+def unit_of(info: dict[str, Any]) -> dict[str, Any]:
+    """What map.json tells of the unit."""
+    return {"metric": info.get("metric", False), "scale": info.get("scale")}

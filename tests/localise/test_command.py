@@ -17,12 +17,13 @@ from PIL import Image
 import perception
 from perception.cli import main
 from perception.errors import InputError
-from perception.inputs.transforms import in_map_frame, lens_values, read_frames, unit_of
+from perception.inputs.transforms import in_map_frame, lens_values, read_frames
 from perception.localise.photos import new_photos
 from perception.map.files import MapFiles
 from perception.map.map import Map
 from perception.map.write import read_map, write_map
 from perception.photos.lens import camera_from_lens
+from perception.photos.view_json import unit_of
 from perception.progress import QUIET
 from perception.types import Lens
 from support.painted_room import FOCAL, PaintedRoom, difference, walk, write_room_map
