@@ -40,7 +40,7 @@ def register(commands: Any) -> None:
     )
     p.add_argument("-o", "--output", type=Path, metavar="OUT", help=".ply, .pcd or .npz; .spz: Gaussians")
     p.add_argument("--smooth", action=argparse.BooleanOptionalAction, default=True)
-    p.add_argument("--max-distance", type=float, metavar="D", help="points farther from any Gaussian stay -1")
+    p.add_argument("--max-distance", type=float, metavar="D", help="map units; points farther from any Gaussian are -1")
     p.add_argument("--segments", type=Path, metavar="X.segs.json", help="ScanNet's segments, or scannet: by its rules")
     p.add_argument(
         "--granularity", choices=("parts", "default", "groups"), default="default", help="parts of things, or groups"
@@ -187,6 +187,7 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         outputs = "-o OUT, --mesh OUT, --splat OUT.ply, --voxels OUT.npz or --graph OUT.json"
         raise InputError(f"export: nothing to write; give {outputs}")
     _refuse_unused(args)
+    options = ExportOptions(max_distance=args.max_distance, smooth=args.smooth, segments=args.segments)
     if (args.mesh, args.voxels, args.voxel_size) != (None, None, None):
         from perception.export.mesh import check_outputs
 
@@ -223,7 +224,6 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
             lines.append(text)
     if args.output is None:
         return facts, "\n".join(lines)
-    options = ExportOptions(max_distance=args.max_distance, smooth=args.smooth, segments=args.segments)
     pose = args.transform or args.align
     result, table = export_map(args.map, args.output, args.points, options, args.color, pose, args.granularity)
     return {**facts, **result}, "\n".join([*lines, table])

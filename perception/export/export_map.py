@@ -45,7 +45,7 @@ class ExportOptions:
 
     max_distance: in map units, beyond which points stay unlabelled; None = no limit.
     smooth: superpoint vote, on or off. segments: a ScanNet *.segs.json to use instead of our own segmentation, or
-    SCANNET for the one that ScanNet's segmentator makes of a mesh.
+    SCANNET for the one that ScanNet's segmentator makes of a mesh. InputError for a negative distance.
 
     >>> ExportOptions(max_distance=0.05, smooth=False)
     ExportOptions(max_distance=0.05, smooth=False, segments=None)
@@ -54,6 +54,10 @@ class ExportOptions:
     max_distance: float | None = None
     smooth: bool = True
     segments: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.max_distance is not None and not self.max_distance >= 0:
+            raise InputError(f"max_distance is {self.max_distance}; expected a length that is not negative")
 
 
 def rendered_depth(gmap: Map, most: int, long_side: int) -> list[DepthView]:
@@ -162,7 +166,8 @@ def export_map(
         cloud = PointCloud(means[rows], rgb8_from_sh(gmap.sh[rows, 0]))
         labels = ids[rows].astype(np.int32)
     else:
-        labels = export_labels(means, ids, cloud, options)
+        limit = None if options.max_distance is None else options.max_distance / scale_of(map_from_cloud)
+        labels = export_labels(means, ids, cloud, replace(options, max_distance=limit))
     inside = check_overlap(means, cloud.points)
     if color == "instance":
         cloud = replace(cloud, colors=instance_palette(labels))
@@ -241,11 +246,10 @@ def export_labels(
     means: np.ndarray, instance_ids: np.ndarray, cloud: PointCloud, options: ExportOptions | None = None
 ) -> np.ndarray:
     """Instance of each point [P] int32, −1 = none: that of the nearest mean (OpenSplat3D, point cloud transfer).
-    means [N, 3] in the cloud's frame, instance_ids [N] int32 (−1 = noise, ignored as in the released code)."""
+    means [N, 3] in the cloud's frame, instance_ids [N] int32 (−1 = noise, ignored as in the released code). Lengths
+    of the options are in the cloud's unit."""
     options = options or ExportOptions()
     limit = options.max_distance
-    if limit is not None and not limit >= 0:
-        raise InputError(f"max_distance is {limit}; expected a length that is not negative")
     used = np.isfinite(means).all(axis=1) & (instance_ids >= 0)
     nearest = nearest_gaussian(cloud.points, means[used], max_distance=limit)
     labels = np.append(instance_ids[used], -1).astype(np.int32)[nearest]

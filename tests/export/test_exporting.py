@@ -60,6 +60,24 @@ def test_order_number_and_columns_of_a_scan_are_kept(suffix: str, smooth: bool, 
     assert ("stamp" in back.labels) == (suffix == "npz") == ("left_out" not in facts) == ("stamp" not in table)
 
 
+def test_the_largest_distance_is_in_map_units_whatever_the_unit_of_the_scan(tmp_path: Path) -> None:
+    """A scan in millimetres, known by its transform: the same points get an instance as of the scan in metres."""
+    gmap = small_map(60)
+    gmap.instance_ids[:] = 0
+    write_map(tmp_path / "m.gsmap", gmap)
+    points = gmap.means + np.linspace(0, 0.2, 60)[:, None] * [0, 0, 1]
+    near = np.linalg.norm(points[:, None] - gmap.means[None], axis=2).min(axis=1) <= 0.05
+    assert 5 < near.sum() < 55
+    np.savez(tmp_path / "scan.npz", points=1000 * points)
+    np.savetxt(tmp_path / "pose.txt", np.diag([0.001, 0.001, 0.001, 1]))
+    options, output = ExportOptions(max_distance=0.05, smooth=False), tmp_path / "out.npz"
+    facts, _ = export_map(tmp_path / "m.gsmap", output, tmp_path / "scan.npz", options, pose=tmp_path / "pose.txt")
+    np.testing.assert_array_equal(read_cloud(output).labels["instance_id"] == 0, near)
+    assert facts["max_distance"] == 0.05
+    with pytest.raises(InputError, match="max_distance is -1"):
+        ExportOptions(max_distance=-1)
+
+
 def test_what_is_gone_has_no_splat(tmp_path: Path) -> None:
     path = write_visited_map(tmp_path / "a.gsmap")
     facts, _ = export_splat(path, tmp_path / "s.ply", each=True)
