@@ -244,7 +244,7 @@ def _refuse_unused(args: argparse.Namespace) -> None:
         ("--color", args.color != "original", cloud or args.mesh, f"{written} or --mesh OUT"),
         ("--align", args.align, scan, f"--points CLOUD {written}"),
         ("--transform", args.transform, scan, f"--points CLOUD {written}"),
-        ("--segments", args.segments, scan, f"--points CLOUD {written}"),
+        ("--segments", args.segments, scan and args.smooth, f"--points CLOUD {written} and --smooth"),
         ("--max-distance", args.max_distance is not None, scan, f"--points CLOUD {written}"),
     )
     for name, given, used, needed in uses:

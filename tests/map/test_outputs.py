@@ -145,7 +145,13 @@ def test_an_option_that_changes_nothing_that_is_written_is_refused(
     assert f"{name} changes nothing" in told and told.count("\n") == 1 and contents(place) == before
 
 
-@pytest.mark.parametrize("option", ["--only 0", "--each", "--voxel-size 1", "--instance 0", "--max-distance 1"])
+@pytest.mark.parametrize(
+    "option",
+    [
+        *("--only 0", "--each", "--voxel-size 1", "--instance 0", "--max-distance 1"),
+        "--segments scannet --no-smooth --points scan.ply",
+    ],
+)
 def test_an_option_of_another_output_is_refused(option: str, place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", "m.gsmap", "-o", "new.ply", *option.split()]) == 2
     assert f"{option.split()[0]} changes nothing" in capsys.readouterr().err and not (place / "new.ply").exists()
