@@ -76,7 +76,7 @@ class Session:
         hits = self._loaded().query(text, top_k + len(hidden))
         self.gone = self._loaded().gone(text, top_k)
         self.question = " ".join(text.split())
-        self.hits = [hit for hit in hits if hit.instance_id not in hidden][:top_k]
+        self.hits = [hit for hit in hits if hidden.isdisjoint((hit.instance_id, *hit.instances))][:top_k]
         self.select(None)
         for hit in self.hits[:1]:
             self.show_hit(hit)
@@ -156,7 +156,11 @@ class Session:
         self.selected = [instance for instance in self.selected if instance in known]
         self.part = self.part if self.part in parts else None
         self.gone = [hit for hit in self.gone if hit.instance_id in known]
-        self.hits = [hit for hit in self.hits if hit.instance_id in known and hit.part in {None, *parts}]
+        self.hits = [
+            hit
+            for hit in self.hits
+            if known.issuperset((hit.instance_id, *hit.instances)) and hit.part in {None, *parts}
+        ]
 
     def reopen(self) -> None:
         """Opens the map that another program changed; unsaved edits are dropped."""

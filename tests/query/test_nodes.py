@@ -15,6 +15,7 @@ from perception.language.colors import PALETTE
 from perception.language.description import InstanceDescription, to_arrays
 from perception.map.write import read_map, write_map
 from perception.query import QueryMap, Where, axis_box, load_map
+from perception.viewer.session import Session
 from support.query_maps import HashEncoder, encoders, write_map_of
 from support.visited_map import NAMES, number, write_visited_map
 
@@ -135,3 +136,23 @@ def test_granularity_of_an_export(path: Path, tmp_path: Path) -> None:
     for level in ("parts", "groups"):
         with pytest.raises(InputError, match=f"holds no {level} of instances"):
             at_granularity(read_map(bare), level)
+
+
+def test_the_viewer_shows_no_group_of_which_a_member_is_hidden_or_gone(path: Path, tmp_path: Path) -> None:
+    write_map(tmp_path / "m.gsmap", read_map(path))
+    session = Session(tmp_path / "m.gsmap")
+
+    def groups() -> list[tuple[int, ...]]:
+        session._loaded().encoders = encoders
+        return [hit.instances for hit in session.ask("breakfast") if hit.instances]
+
+    assert groups() == [(5, 6)] and session.selected == [5, 6]
+    session.editor.hide(6)
+    session.edited()
+    assert groups() == []
+    session.show_all()
+    session.edited()
+    assert groups() == [(5, 6)]
+    session.editor.remove(6)
+    session.edited()
+    assert session.hits == [] and session.selected == [5]
