@@ -73,6 +73,7 @@ class Editor:
     def __init__(self, path: Path):
         self.path = Path(path) if Path(path).name else Path(path).absolute()
         self._lock = threading.RLock()
+        self._last_id = -1  # the largest id that was ever given here
         self.reopen()
 
     @_step
@@ -85,6 +86,7 @@ class Editor:
         self._past = [_State("opened", gmap.instance_ids, tuple(gmap.instances), tuple(descriptions))]
         self._future: list[_State] = []
         self._saved = self._past[0]
+        self._last_id = max([self._last_id, *(entry["id"] for entry in gmap.instances), *self._known_parts()])
 
     # ------------------------------------------------------------------ reading
 
@@ -301,11 +303,9 @@ class Editor:
         return cluster_gaussians(gmap.means[rows], gmap.scales[rows], gmap.opacities[rows], gmap.features[rows], finer)
 
     def _next_id(self) -> int:
-        entries = [entry for state in (*self._past, *self._future) for entry in state.instances]
-        number = 1 + max((e["id"] for entry in entries for e in (entry, *entry.get("parts", []))), default=-1)
-        if number > LARGEST:
+        if self._last_id >= LARGEST:
             raise InputError(f"{self.path}: has the id {LARGEST}, the largest; there is none left for another instance")
-        return number
+        return self._last_id + 1
 
     def _entry(self, instance: int, ids: np.ndarray, score: float, views: int, label: Any = None) -> dict[str, Any]:
         gmap, rows = self.original, ids == instance
@@ -324,6 +324,7 @@ class Editor:
         descriptions = now.descriptions
         if descriptions:
             descriptions = spliced(descriptions, [_joined([descriptions[row] for row in rows])] * len(new))
+        self._last_id = max([self._last_id, *(entry["id"] for entry in new)])
         self._push(what, ids=ids, instances=spliced(now.instances, new), descriptions=descriptions)
 
 

@@ -101,6 +101,15 @@ def test_a_merged_instance_can_be_merged_again(path: Path) -> None:
     assert len(read_map(path).language["embeddings"]) == 1
 
 
+def test_an_id_that_was_saved_and_undone_is_given_to_nothing_else(path: Path) -> None:
+    editor = Editor(path)
+    first = editor.merge([0, 1])
+    editor.save()
+    editor.undo()
+    editor.rename(2, "cup")  # what was undone is forgotten
+    assert editor.merge([1, 2]) > first
+
+
 def test_split_finds_the_two_halves(path: Path) -> None:
     editor = Editor(path)
     parts = editor.split(2)
