@@ -58,7 +58,8 @@ class Encoder(Protocol):
 
     identity: model, version and preprocessing. A map stores it, and embeddings of another encoder are refused.
     dim: length of an embedding. templates: sentences with one {} for the prompt; their embeddings are averaged.
-    An encoder may also have a `reading`, see `reading_of`.
+    An encoder may also have a `reading`, see `reading_of`, and `reads(text)`: whether it knows any word of a text; all
+    texts are read where it has none.
     """
 
     @property

@@ -75,6 +75,10 @@ class ConseEncoder:
         meant = unit_rows(sentences - self._classes.mean(axis=0))
         return unit_rows(np.concatenate([meant, self.classes_meant(meant, texts)], axis=1))
 
+    def reads(self, text: str) -> bool:
+        """Whether the sentence encoder knows any word of the text (`MiniLM.reads`)."""
+        return self._sentences.reads(text)
+
     def classes_meant(self, sentences: np.ndarray, texts: Sequence[str]) -> np.ndarray:
         """√q [n, 1000], unit rows, from centred sentence embeddings [n, 384] and the table of household things."""
         cosines = sentences @ self._centred.T

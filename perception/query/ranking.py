@@ -24,6 +24,7 @@ Further rules:
     at least (1 − LAPSE) Φ((cos(t, l_i) − m_i) / s_i − LABEL_MARGIN) for a label l_i of the user, where m_i and s_i are
         mean and standard deviation of cos(p, l_i) over the probes p, or over texts that encoders may not understand and
         find all alike (unread.txt), whichever of the two asks for more;   1 if the label equals the prompt
+    a prompt of which the encoder knows no word (`Encoder.reads`) has z_ti = the bonuses, and is like no label
 
 An instance answers if it scores PRESENT or more and its Φ⁻¹(score / (1 − LAPSE)) is at most BESIDE below the best:
 "chair" has four answers, "red chair" one. All of this is relative to one map. `Prepared` holds what a prompt needs of a
@@ -130,6 +131,10 @@ class TextEncoder:
         self.canonical = self.embed(self.reading.canonical)
         self.probes = self.embed(probes())
         self._usual = [float(self._spreads(self.probes, *part).mean()) for part in self.parts]
+
+    def reads(self, text: str) -> bool:
+        """Whether the encoder knows any word of the text."""
+        return not hasattr(self.encoder, "reads") or self.encoder.reads(text)
 
     def embed(self, texts: Sequence[str]) -> np.ndarray:
         """Text embeddings, averaged over the encoder's templates; unit rows [T, D]."""
@@ -241,9 +246,11 @@ class Scorer:
         """Scores [I] for a prompt; quoted: what must be printed on the instance; gain: added to z."""
         reading, known = self.encoder.reading, self.prepared
         colors = color_words(text.partition(" with ")[0] if reading.colors else text)  # "duck with red hat" is not red
-        row = self.encoder.embed([text if reading.colors else without_color_words(text)])
-        middle, spread = known.null.T
-        z = (self.encoder.relevancy(row, known.compared)[0] - middle) / spread + self._shape_bonus(text) + gain
+        asked = text if reading.colors else without_color_words(text)
+        row, (middle, spread) = self.encoder.embed([asked]), known.null.T
+        z = self._shape_bonus(text)
+        if self.encoder.reads(asked):
+            z = (self.encoder.relevancy(row, known.compared)[0] - middle) / spread + z + gain
         if usual := household_thing(text):
             length, thickness = np.nan_to_num(np.minimum(size_misfits(known.sides, usual), 2.0))
             z = z - SIZE_WEIGHT * length - THICK_WEIGHT * thickness
@@ -292,7 +299,7 @@ class Scorer:
         fits = self.prepared.label_rows @ self.encoder.embed([text])[0]
         z = ((fits - middle) / spread).astype(np.float64)
         same = np.array([name == tidy(text) for name in self._names])
-        alike = (1 - LAPSE) * normal_cdf(z - LABEL_MARGIN)
+        alike = (1 - LAPSE) * normal_cdf(z - LABEL_MARGIN) if self.encoder.reads(text) else 0.0
         scores[self._named] = np.where(same, 1.0, np.maximum(scores[self._named], alike))
         return scores
 

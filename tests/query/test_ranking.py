@@ -32,6 +32,7 @@ from perception.language.description import (
     to_arrays,
     unseen,
 )
+from perception.language.printed import Printed
 from perception.language.shape_words import KINDS
 from perception.query.ranking import BESIDE, LAPSE, PRESENT, Answer, Ranker, answering, least_score, probes
 
@@ -154,6 +155,19 @@ def test_a_label_that_the_encoder_cannot_read_answers_to_itself_alone(label: str
     things = [unseen(encoder.dim)]
     assert not rank(prompt, things, encoder, labels=[label]).present  # another thing, in words that no list here holds
     assert rank(label, things, encoder, labels=[label]).hits == [(0, 1.0)]
+
+
+def test_a_prompt_of_which_the_encoder_knows_no_word_is_answered_by_print_and_names_alone() -> None:
+    """Each thing, red, looks as the encoder takes one of the prompts to be."""
+    encoder, prompts = ConseEncoder(), ["🍌", "red 🍌", "καρέκλα", "কলা", "여우", "ＦＯＸ", "狐", "?", "..."]
+    things = [_thing(row, (200, 25, 30)) for row in encoder.encode_texts(prompts)]
+    print_of_3 = Printed([[{"text": "КОФЕ", "score": 1.0}] if n == 3 else [] for n in range(len(things))])
+    plain, named = Ranker(things, encoder), Ranker(things, encoder, ["🦊", "αλεπού", "শিয়াল", *prompts[:6]])
+    printed = Ranker(things, encoder, printed=print_of_3)
+    for n, prompt in enumerate(prompts):
+        assert not plain.rank(prompt).present
+        assert [i for i, _ in answering(named.rank(prompt).hits)] == ([n + 3] if n < 6 else [])
+    assert [i for i, _ in answering(printed.rank("кофе").hits)] == [3] and not printed.rank("чай").present
 
 
 @pytest.mark.parametrize(("label", "prompt"), [("red mug", "cup"), ("armchair", "chair"), ("fridge", "refrigerator")])
