@@ -73,7 +73,7 @@ class Where:
             names = [self.labels] if isinstance(self.labels, str) else self.labels
             if not isinstance(names, Collection) or not all(isinstance(name, str) for name in names):
                 raise InputError(f"where: labels are {names!r:.80}, expected texts")
-            object.__setattr__(self, "labels", frozenset(tidy(name) for name in names))
+            object.__setattr__(self, "labels", frozenset(tidy(name) for name in names) - {""})
         for name in ("share", "within", "min_size", "max_size"):
             check_length(f"where: {name}", getattr(self, name))
         if not 0 < self.share <= 1:

@@ -119,6 +119,7 @@ def test_filters_of_size_label_and_distance(gmap: QueryMap, arrays: Map) -> None
     ]
     assert [hit.instance_id for hit in gmap.find(Where(labels="my  fruit"))] == [4]
     assert gmap.find(Where(labels=["fruit"])) == []
+    assert gmap.find(Where(labels=["", " "])) == []  # what has no label has none of these
     point = grid(9)[0]
     for within in (0.0, 0.9, 1.1, 9.0):
         expected = [k for k in range(3, 12) if np.linalg.norm(members(arrays, k) - point, axis=1).min() <= within]
