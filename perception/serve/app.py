@@ -14,6 +14,7 @@ from starlette.concurrency import run_in_threadpool
 
 from perception import __version__
 from perception.errors import InputError
+from perception.io.json_shapes import LARGEST
 from perception.io.ply import ply_bytes
 from perception.query import Frame, Hit, QueryMap
 from perception.serve.bodies import AtBody, FindBody, NearestBody, QueryBody
@@ -48,7 +49,7 @@ T = TypeVar("T")
 MapId = Annotated[str | None, Query(description="answer only from this very map, else 409")]
 At = Annotated[int | None, Query(ge=0, lt=10**9, description="as of this visit; else today")]
 Since = Annotated[int | None, Query(ge=0, lt=10**9, description="a visit; else the one before the newest")]
-Id = Annotated[int, Path(alias="id", ge=0, lt=10**9)]
+Id = Annotated[int, Path(alias="id", ge=0, le=LARGEST)]
 _ABOUT = (
     "Text prompts and positions in, 3D instances of a map out. Lengths are in the unit of the map's frame, metres when "
     "`metric`. With `frame`, everything in a request and its answer is in that frame. An error is one JSON object, "

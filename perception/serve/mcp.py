@@ -23,6 +23,7 @@ from scipy.spatial import cKDTree
 from perception import __version__
 from perception.errors import InputError, missing_extra
 from perception.geometry import scale_of
+from perception.io.json_shapes import LARGEST
 from perception.map.history import change_in
 from perception.query import Frame, Hit, QueryMap, Where
 from perception.query.crops import OUTSIDE, PhotoOutside, best_crop, photos_outside
@@ -59,7 +60,7 @@ _ABOUT = (
 )
 CROP_SIDE = 512  # most pixels of the longer side of a picture
 
-Id = Annotated[int, Field(ge=0, lt=10**9, description="instance_id of an answer")]
+Id = Annotated[int, Field(ge=0, le=LARGEST, description="instance_id of an answer")]
 Top = Annotated[int, Field(ge=1, le=MAX_TOP, description="most instances in the answer")]
 Framed = Annotated[
     Annotated[Text, Tag("single")] | Annotated[FrameBody, Tag("nested")],

@@ -95,6 +95,17 @@ def test_a_parameter_of_another_page_is_refused(client: TestClient) -> None:
     assert client.get("/instances?at=0").status_code == client.get("/health?now=1").status_code == 200
 
 
+def test_an_instance_is_served_whatever_its_id(tmp_path: Path) -> None:
+    """Ids are 0 to 2³¹ − 1 (docs/formats.md)."""
+    path = write_map_of(tmp_path / "m.gsmap", gaussians=90, first_id=2**31 - 9)
+    with QueryEngine(path, watch=None, encoders=encoders) as engine:
+        client = client_of(engine)
+        listed = [hit["instance_id"] for hit in client.get("/instances").json()["hits"]]
+        assert listed[-1] == 2**31 - 1
+        assert all(client.get(f"/instances/{i}").json()["instance_id"] == i for i in listed)
+        assert client.get(f"/instances/{listed[-1]}/points?format=ply").status_code == 200
+
+
 def test_filters_and_frames_pass_through(client: TestClient, engine: QueryEngine) -> None:
     where = {"region": {"min": [1.5, -0.5, -1], "max": [2.5, 0.5, 1]}, "min_size": 0.1}
     answer = client.post("/query", json={"text": "mug", "min_score": 0, "where": where}).json()
