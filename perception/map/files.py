@@ -110,12 +110,14 @@ class MapFiles:
         if name == "instance_ids":
             with _damage_in(self.path / f"{name}.npy"):
                 check_ids(self._arrays[name], [e["id"] for e in self.instances if not is_removed(e)])
-        if name in _ARRAYS:
-            return np.array(self._arrays[name])
+        file = self.path / (f"{name}.npy" if name in _ARRAYS else "gaussians.ply")
         try:
-            return _OF_PLY[name](self._rows)
+            values = np.array(self._arrays[name]) if name in _ARRAYS else _OF_PLY[name](self._rows)
         except (KeyError, ValueError) as error:
-            raise damaged(self.path / "gaussians.ply", f"is no 3DGS cloud ({error})") from error
+            raise damaged(file, f"is no 3DGS cloud ({error})") from error
+        if np.isnan(values).any() or (name == "means" and np.isinf(values).any()):
+            raise damaged(file, f"{name}: holds NaN or infinity")
+        return values
 
     def _check_contents(self) -> None:
         """Compares the SHA-256 of every file with the one recorded, once; InputError names the first that differs.

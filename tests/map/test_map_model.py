@@ -148,6 +148,14 @@ def test_a_row_for_each_gaussian(path: Path, name: str) -> None:
     told(path, f"{name}.npy", "179 rows")
 
 
+@pytest.mark.parametrize(("name", "value"), [("means", np.inf), ("means", np.nan), ("quats", np.nan), ("sh", np.nan)])
+def test_gaussians_that_are_no_numbers_are_told(path: Path, name: str, value: float) -> None:
+    array = getattr(whole := read_map(path), name).copy()
+    array.reshape(-1)[7] = value
+    write_map(path, Map.of(whole, **{name: array}))
+    told(path, "gaussians.ply", f"{name}: holds NaN or infinity")
+
+
 def test_unknown_keys_are_kept(path: Path) -> None:
     change(path, "map.json", ("robot",), {"name": "é", "list": [1, {"a": None}]})
     change(path, "instances.json", ("instances", 0, "color"), ["red", 1.5])
