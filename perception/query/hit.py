@@ -32,7 +32,7 @@ class Hit:
     points: [P, 3] float32, read-only, the means of its Gaussians. centroid: [3] float64, weighted by opacity.
     obb: oriented bounding box of the points. covariance: [3, 3] float64 of the points about their mean, divided by P.
     score: in [0, 1]; for a text prompt how well the instance matches, else the mapper's confidence. views: the photos
-    that show it best, best first. distance: from the query's position to the nearest point; None without a position.
+    that show it best, best first. distance: from the query's position to the nearest point; None without either.
     part: id of the part that fits better than its instance; instances: ids of the group that fits better than its
     members; points, box and colours are then the part's or the group's. colors(): [P, 3] uint8 of the points, read when
     called; None where they are not known. All of it is in `frame`, in metres when the map is metric.

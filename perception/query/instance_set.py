@@ -57,9 +57,9 @@ class InstanceSet:
         return labels is None or tidy(self.entries[row].get("label") or "") in labels
 
     def measured(self, row: int, where: Where, score: float | None = None) -> Hit:
-        """As `hit`, with its distance if `where.near` is given."""
+        """As `hit`, with its distance if `where.near` is given and it has points."""
         hit = self.hit(row, score)
-        if where.near is None:
+        if where.near is None or not hit.num_points:
             return hit
         return replace(hit, distance=self.spatial.distance(int(self.entries[row]["id"]), np.asarray(where.near)))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 import perception
 from perception.errors import InputError
-from perception.map.write import Map, read_map, set_labels
+from perception.map.write import Map, read_map, set_labels, write_map
 from perception.query import Frame, QueryMap, Where, axis_box, load_map
 from perception.types import OrientedBox
 from support.query_maps import NAMES, encoders, write_map_of
@@ -107,6 +108,17 @@ def test_instance_at_follows_the_points_spacing(gmap: QueryMap, arrays: Map) -> 
     assert near is not None and near.distance is not None and np.isclose(near.distance, gap, rtol=1e-9)
     assert gmap.instance_at(outside, max_distance=gap * 0.999) is None
     assert gmap.instance_at([0, 0, 100.0]) is None
+
+
+def test_an_instance_without_gaussians_has_no_distance(path: Path, tmp_path: Path) -> None:
+    """Such a map is made by hand; JSON holds no infinity."""
+    bare = read_map(path)
+    bare.instance_ids[bare.instance_ids == 5] = -1
+    bare.instances[2]["num_gaussians"] = 0
+    write_map(tmp_path / "bare.gsmap", bare)
+    hits = load_map(tmp_path / "bare.gsmap", encoders).find(Where(near=[0.0, 0.0, 0.0]))
+    assert [hit.instance_id for hit in hits if hit.distance is None] == [5]
+    assert json.loads(json.dumps([hit.to_json() for hit in hits], allow_nan=False))[2]["num_points"] == 0
 
 
 def test_filters_of_size_label_and_distance(gmap: QueryMap, arrays: Map) -> None:
