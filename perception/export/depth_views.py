@@ -93,6 +93,8 @@ def fused_surface(views: Sequence[DepthView]) -> tuple[np.ndarray, np.ndarray]:
     """Mean point and unit normal, [P, 3] float64 each, of every second depth pixel in each cell of a grid, an eightieth
     of the extent wide; normals face the cameras."""
     points, normals = (np.concatenate(parts) for parts in zip(*map(_backprojected, views), strict=True))
+    if not len(points):
+        return points, normals
     low, high = np.percentile(points, [2, 98], axis=0)
     cell, count = grid_cells(points, float(np.linalg.norm(high - low)) / 80)
     mean, turned = (sums_by(cell, values, len(count)) / count[:, None] for values in (points, normals))

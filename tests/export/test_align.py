@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -146,6 +147,12 @@ def test_a_scan_of_another_place_is_refused(furnished: list[module.DepthView]) -
 def test_a_scan_that_holds_too_little_is_an_error(scan: np.ndarray, furnished: list[module.DepthView]) -> None:
     with pytest.raises(InputError, match="scan: "):
         align(furnished, PointCloud(scan), similar=True)
+
+
+def test_views_that_show_no_surface_are_told(furnished: list[module.DepthView]) -> None:
+    blind = [replace(view, depth=np.zeros_like(view.depth)) for view in furnished]
+    with pytest.raises(InputError, match="500 finite points, 0 of the map are seen"):
+        align(blind, PointCloud(np.random.default_rng(0).random((500, 3))), similar=True)
 
 
 def test_views_tell_surface_from_free_and_hidden_space(furnished: list[module.DepthView]) -> None:
