@@ -172,6 +172,7 @@ def export_map(
     if color == "instance":
         cloud = replace(cloud, colors=instance_palette(labels))
     others = storable(cloud.labels)[1] if output.suffix.lower() != ".npz" else []
+    others += ["faces"] if output.suffix.lower() == ".pcd" and cloud.faces is not None else []
     if others:
         facts["left_out"] = others
     sidecar = write_export(output, cloud, labels, instances, facts)  # last: where it is, everything was written

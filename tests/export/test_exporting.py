@@ -48,7 +48,8 @@ def test_order_number_and_columns_of_a_scan_are_kept(suffix: str, smooth: bool, 
     halves[::7] = np.nan
     stamps = np.arange(60) + 1_700_000_000_000_000_000
     columns = {"gps_time": whole, "scan_label": halves, "stamp": stamps, "instance_id": np.full(60, 99, np.int32)}
-    np.savez(tmp_path / "scan.npz", points=points, **columns)
+    faces = np.array([[0, 1, 2]], np.int32)
+    np.savez(tmp_path / "scan.npz", points=points, faces=faces, **columns)
     output = tmp_path / f"out.{suffix}"
     facts, table = export_map(tmp_path / "m.gsmap", output, tmp_path / "scan.npz", ExportOptions(smooth=smooth))
     back = read_cloud(output)
@@ -57,7 +58,9 @@ def test_order_number_and_columns_of_a_scan_are_kept(suffix: str, smooth: bool, 
     np.testing.assert_array_equal(back.labels["scan_label"], halves)
     assert facts["points"] == 60 and back.labels["instance_id"][[7, 30]].tolist() == [-1, -1]
     assert (back.labels["instance_id"] >= 0).any() and 99 not in back.labels["instance_id"]
-    assert ("stamp" in back.labels) == (suffix == "npz") == ("left_out" not in facts) == ("stamp" not in table)
+    left = {"ply": ["stamp"], "pcd": ["stamp", "faces"]}.get(suffix, [])
+    assert facts.get("left_out", []) == left and all(name in table for name in left)
+    assert ("stamp" in back.labels) == ("stamp" not in left) and (back.faces is None) == ("faces" in left)
 
 
 def test_the_largest_distance_is_in_map_units_whatever_the_unit_of_the_scan(tmp_path: Path) -> None:
