@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from perception.boxes import move_box
-from perception.geometry import check_similarity, move_points
+from perception.geometry import check_similarity, move_points, scale_of
 from perception.types import OrientedBox
 
 
@@ -86,7 +86,7 @@ class Hit:
         `frame` names a. Raises InputError when a_from_b shears or mirrors.
         """
         moved = check_similarity(a_from_b)
-        linear = moved[:3, :3]
+        linear, scale = moved[:3, :3], scale_of(moved)
         points = move_points(moved, self.points)
         points.setflags(write=False)
         return replace(
@@ -97,7 +97,8 @@ class Hit:
             covariance=linear @ self.covariance @ linear.T,
             frame=self.frame if frame is None else frame,
             was=None if self.was is None else move_points(moved, np.asarray(self.was, np.float64)),
-            distance=None if self.distance is None else self.distance * float(np.cbrt(np.linalg.det(linear))),
+            distance=None if self.distance is None else self.distance * scale,
+            metric=self.metric and abs(scale - 1) < 1e-6,
         )
 
     def to_open3d(self) -> Any:

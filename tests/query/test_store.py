@@ -259,6 +259,14 @@ def test_without_the_maps_folder_all_but_points_is_answered(maps: list[Path], tm
         _ = hits[0].points
 
 
+def test_a_hit_in_a_frame_with_another_unit_is_not_metric(store: Path) -> None:
+    hits = load_map(store, encoders).query("mug", min_score=0.0)
+    assert {hit.metric for hit in hits} == {True, False}
+    for hit in hits:
+        turned, larger = (hit.transformed(np.diag([s, s, s, 1.0])) for s in (1.0, 1000.0))
+        assert (turned.metric, larger.metric) == (hit.metric, False)
+
+
 def test_damage_is_told_in_one_line(maps: list[Path], tmp_path: Path) -> None:
     index_maps(tmp_path / "s", maps[1:3], encoders=encoders)
     files = [tmp_path / "s" / "store.json", *(tmp_path / "s" / "maps").iterdir()]
