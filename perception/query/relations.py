@@ -26,12 +26,6 @@ from perception.query.ranking import PRESENT, Answer, Scorer
 TRIM = 0.02  # share of an instance's points left out of its box at either end of each axis
 WEIGHT = 3.0  # added to z for a full match, in standard deviations of the map's probes
 NESTED = 3  # relations that are read in the name of the other thing; each costs as much as a prompt
-_RELATION = re.compile(  # in a text of single spaces, so that every repeat has an end
-    r"(?<= )(?:(?:that|which) )?(?:(?:is|are|stand|sit|lie|hang|lean)(?:s|ing)? )?(?:to the )?"
-    r"(?P<relation>on top of|on|upon|under|underneath|beneath|below|above|over|next to|beside|near|close to|by|inside|"
-    r"in|left of|right of|in front of|behind) (?=.*\w)",
-    re.IGNORECASE,
-)
 _KINDS = {
     "on": ("on top of", "on", "upon"),
     "under": ("under", "underneath", "beneath", "below"),
@@ -44,6 +38,11 @@ _KINDS = {
     "behind": ("behind",),
 }
 _KIND = {phrase: kind for kind, phrases in _KINDS.items() for phrase in phrases}
+_RELATION = re.compile(  # in a text of single spaces, so that every repeat has an end
+    r"(?<= )(?:(?:that|which) )?(?:(?:is|are|stand|sit|lie|hang|lean)(?:s|ing)? )?(?:to the )?"
+    rf"(?P<relation>{'|'.join(sorted(_KIND, key=len, reverse=True))}) (?=.*\w)",  # "in front of" is not "in"
+    re.IGNORECASE,
+)
 _DETAIL = re.compile(r"\b(?:with|of|full|made|without)\b", re.IGNORECASE)
 
 

@@ -22,6 +22,7 @@ from perception.query.relations import LevelBoxes, Relation, parse, ranked
         ("shoes under the chair", ("shoes", "under", "the chair")),
         ("apple in the bowl", ("apple", "in", "the bowl")),
         ("cup standing behind the box", ("cup", "behind", "the box")),
+        ("cup in front of the box", ("cup", "front", "the box")),
         ("magazine with a shell on the cover", None),
         ("bowl of fruit in the kitchen", None),
         ("onion", None),
