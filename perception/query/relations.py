@@ -39,7 +39,8 @@ _KINDS = {
 }
 _KIND = {phrase: kind for kind, phrases in _KINDS.items() for phrase in phrases}
 _RELATION = re.compile(  # in a text of single spaces, so that every repeat has an end
-    r"(?<= )(?:(?:that|which) )?(?:(?:is|are|stand|sit|lie|hang|lean)(?:s|ing)? )?(?:to the )?"
+    r"(?<= )(?:(?:that|which) )?(?:(?:is|are) )?(?:(?:stand|sitt?|lie|ly|hang|lean)(?:s|ing)? )?"
+    r"(?:(?:to|on|at) the (?=left|right))?"
     rf"(?P<relation>{'|'.join(sorted(_KIND, key=len, reverse=True))}) (?=.*\w)",  # "in front of" is not "in"
     re.IGNORECASE,
 )
