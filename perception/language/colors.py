@@ -14,6 +14,7 @@ from itertools import dropwhile
 import numpy as np
 
 from perception.geometry import sums_by
+from perception.language.shape_words import head_noun
 
 PALETTE = 24  # colours kept per instance
 BIN = 8.0  # CIELAB units per histogram cell
@@ -67,10 +68,11 @@ def color_words(text: str) -> list[str]:
     """Colour words of a text in canonical spelling, in order, without duplicates. "many" stands for multicoloured."""
     words = [word.lower() for word in _PATTERN.findall(text)]
     names: list[str] = []
+    fruit = head_noun(text) == "orange"
     for n, word in enumerate(words):
         if (word, words[n + 1] if n + 1 < len(words) else "") in _NOT_A_COLOR:
             continue
-        if word == "orange" and (len(words) == 1 or n == len(words) - 1):
+        if word == "orange" and (n == len(words) - 1 or fruit):
             continue
         name = "many" if word in _MANY else _SYNONYMS.get(word, word)
         if (name in _EXAMPLES or name == "many") and name not in names:

@@ -251,6 +251,7 @@ def test_palette_shares_and_means() -> None:
         ("a Grey, golden chair", ["gray", "gold"], "a chair"),
         ("orange juice carton", [], "orange juice carton"),
         ("orange", [], "orange"),
+        ("the orange on the white plate", ["white"], "the orange on the plate"),
         ("orange food box", ["orange"], "food box"),
         ("colorful cube toy", ["many"], "cube toy"),
         ("red", ["red"], "red"),
