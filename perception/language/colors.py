@@ -53,8 +53,10 @@ _SYNONYMS = {
     "cream": "beige", "navy": "blue", "bluish": "blue", "golden": "gold", "silvery": "silver",
     "olive": "green", "greenish": "green", "amber": "orange", "yellowish": "yellow", "brownish": "brown",
 }  # fmt: skip
-COLOR_WORDS = (*COLOR_NAMES, "many")
-"""All that `color_words` returns."""
+COLOR_WORDS, NOT = (*COLOR_NAMES, "many"), "not "
+"""All that `color_words` returns, with NOT before it or without."""
+_NOT = re.compile(r"(?:\b(?:not|no|non|without)|n['’]t)(?: an?| the)?[ -]$", re.IGNORECASE)
+"""What ends before a colour that a thing is not to have."""
 _MANY = {"colorful", "colourful", "multicolored", "multicoloured", "rainbow"}
 _PATTERN = re.compile(r"[^\W\d_]+")
 # Fruit and metals: before one of these nouns the word is part of the object's name, not a colour.
@@ -65,8 +67,10 @@ _NOT_A_COLOR = {
 
 
 def color_words(text: str) -> list[str]:
-    """Colour words of a text in canonical spelling, in order, without duplicates. "many" stands for multicoloured."""
-    words = [word.lower() for word in _PATTERN.findall(text)]
+    """Colour words of a text in canonical spelling, in order, without duplicates. "many" stands for multicoloured, and
+    "not red" for what a thing is not to be."""
+    found = list(_PATTERN.finditer(text))
+    words = [match[0].lower() for match in found]
     names: list[str] = []
     fruit = head_noun(text) == "orange"
     for n, word in enumerate(words):
@@ -75,9 +79,10 @@ def color_words(text: str) -> list[str]:
         if word == "orange" and (n == len(words) - 1 or fruit):
             continue
         name = "many" if word in _MANY else _SYNONYMS.get(word, word)
-        if (name in _EXAMPLES or name == "many") and name not in names:
-            names.append(name)
-    return names
+        if name in _EXAMPLES or name == "many":
+            start = found[n].start()
+            names.append(f"{NOT}{name}" if _NOT.search(text[max(0, start - 15) : start]) else name)
+    return list(dict.fromkeys(names))
 
 
 def without_color_words(text: str) -> str:

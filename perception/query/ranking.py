@@ -44,7 +44,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.language.base import Encoder, Part, check_texts, normal_cdf, reading_of, unit_rows
-from perception.language.colors import COLOR_WORDS, color_share, color_words, match_of_shares, without_color_words
+from perception.language.colors import COLOR_WORDS, NOT, color_share, color_words, match_of_shares, without_color_words
 from perception.language.description import InstanceDescription
 from perception.language.household import household_thing, size_misfits
 from perception.language.printed import Printed, quoted_text
@@ -261,7 +261,8 @@ class Scorer:
         elif self._printed:
             z = z + PRINTED_WEIGHT * self._printed.evidence(text)
         if colors:
-            shares = [known.colors[:, COLOR_WORDS.index(word)] for word in colors]
+            shares = [known.colors[:, COLOR_WORDS.index(word.removeprefix(NOT))] for word in colors]
+            shares = [0.5 - np.minimum(s, 0.5) if w.startswith(NOT) else s for s, w in zip(shares, colors, strict=True)]
             z = z + COLOR_WEIGHT * (match_of_shares(shares) - 0.5)
         a, b = reading.calibration
         scores = (1 - LAPSE) * normal_cdf(a * z + b) * np.minimum(1.0, QUOTED_LEAST + borne)

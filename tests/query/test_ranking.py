@@ -252,6 +252,10 @@ def test_palette_shares_and_means() -> None:
         ("orange juice carton", [], "orange juice carton"),
         ("orange", [], "orange"),
         ("the orange on the white plate", ["white"], "the orange on the plate"),
+        ("the mug that is not red", ["not red"], "the mug that is not red"),
+        ("white mug, non-red", ["white", "not red"], "mug, non-red"),
+        ("mug that isn't a blue one", ["not blue"], "mug that isn't a blue one"),
+        ("knot red mug", ["red"], "knot mug"),
         ("orange food box", ["orange"], "food box"),
         ("colorful cube toy", ["many"], "cube toy"),
         ("red", ["red"], "red"),
@@ -262,6 +266,14 @@ def test_palette_shares_and_means() -> None:
 def test_color_words(text: str, words: list[str], rest: str) -> None:
     assert color_words(text) == words
     assert without_color_words(text) == rest
+
+
+def test_a_colour_that_is_ruled_out_speaks_for_the_others() -> None:
+    axes, prompts = np.eye(DIM), ("red mug", "mug that is not red", "white mug, not red")
+    encoder = Table(dict.fromkeys(("mug", *prompts, "mug, not red"), axes[0]))
+    things = [_thing(axes[0], (200, 25, 30)), _thing(axes[0], (250, 250, 250)), _thing(axes[1])]
+    assert [rank(prompt, things, encoder).hits[0][0] for prompt in prompts] == [0, 1, 1]
+    assert [i for i, _ in answering(rank("mug", things, encoder).hits)] == [0, 1]
 
 
 def test_shares_follow_the_painted_fraction() -> None:
