@@ -27,7 +27,8 @@ RIVAL = 4  # a match counts by (its quality / that of the map's best)^RIVAL: whe
 _SAYS = re.compile(  # in a text of single spaces, so that every repeat has an end
     r"(?<=[, ])(?:(?:that|which) )?(?:(?:says?|saying|titled|labell?ed)(?: (?:as|with))?|"
     r"(?:reads?|reading|marked)(?= [\"'“«A-Z0-9])|"
-    r"(?:with|bears?|has|bearing|having) (?:the )?(?:words?|texts?|titles?|labels?|letters|names?|print|inscription)) "
+    r"(?:with|bears?|has|bearing|having) (?:the )?(?:words?|texts?|titles?|labels?|letters|names?|print|inscription)"
+    r"(?! (?:on|in|of|at|across|along|around) )) "  # "with text on it" says where it is
     r"(?=.*\w)"
 )
 _QUOTED = re.compile(r"[\"“”«»]([^\"“”«»\w]*\w[^\"“”«»]*)[\"“”«»]")
