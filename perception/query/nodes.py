@@ -80,7 +80,7 @@ class Nodes:
         shapes, relations and prints are left alone. Only nodes that fulfil `where`, with the labels of their instances,
         which is in the map's frame."""
         special = shape_kind(text) or parse(text) or quoted_text(text)
-        if not self._nodes or special or hits[0][1] == 1.0:
+        if not self._nodes or not hits or special or hits[0][1] == 1.0:
             return list(hits)
         score, count = dict(self._ranker.rank(text).hits), len(hits)
         z = {n: float(evidence_of(np.array(s))) for n, s in score.items()}

@@ -342,7 +342,7 @@ class QueryMap(Map):
 
     @cached_property
     def _ranking(self) -> TextRanking:
-        return TextRanking(self, self.encoders)
+        return TextRanking(self, self.encoders, [entry.get("label") for entry in self.record.instances])
 
     @cached_property
     def _nodes(self) -> Nodes:

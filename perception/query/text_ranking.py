@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -25,10 +25,11 @@ REMEMBERED = 256
 
 
 class TextRanking:
-    """Ranks the instances of `gmap` for prompts; thread-safe. `encoders` makes an encoder from its name."""
+    """Ranks the instances of `gmap` for prompts; thread-safe. `encoders` makes an encoder from its name. names: labels
+    that the user gave to other instances as well, which stood in the map once."""
 
-    def __init__(self, gmap: Map, encoders: Encoders | None) -> None:
-        self._gmap, self._encoders = gmap, encoders or make_encoder
+    def __init__(self, gmap: Map, encoders: Encoders | None, names: Sequence[str | None] = ()) -> None:
+        self._gmap, self._encoders, self._names = gmap, encoders or make_encoder, names
         self._lock = threading.RLock()
         self._made: Ranker | InputError | None = None
         self._remembered = lru_cache(REMEMBERED)(self._ranked)
@@ -36,13 +37,15 @@ class TextRanking:
     def rank(self, text: str) -> Answer:
         """The ranking of `perception.query.ranking`. Without embeddings or encoder, the instances with this label.
 
-        Raises InputError when the map has no embeddings or encoder and no instance has the label `text`.
+        Raises InputError when the map has no embeddings or encoder and no instance has, or had, the label `text`.
         """
         try:
             _ = self.ranker
         except InputError:
             if (answer := self._by_label(text)) is not None:
                 return answer
+            if any(tidy(name or "") == tidy(text) for name in self._names):
+                return Answer(text, [], False)
             raise
         return self._remembered(" ".join(text.split()))
 

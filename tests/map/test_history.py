@@ -15,7 +15,7 @@ from perception.edit.scale import scaled
 from perception.errors import InputError
 from perception.map.history import Visit, change_in, changes_of, date_of, joined_record, visits_of
 from perception.map.map import Map
-from perception.map.write import read_map, write_map
+from perception.map.write import read_map, set_labels, write_map
 from perception.query import QueryMap, load_map
 from support.query_maps import encoders
 from support.visited_map import NAMES, SEEN, STATES, STOOD, TIMES, ball, cell, number, write_visited_map
@@ -83,6 +83,19 @@ def test_a_gone_thing_is_no_hit_and_is_named(gmap: QueryMap) -> None:
     assert np.array_equal(gone.points, ball("mug", 0)) and gmap.gone("lamp") == []
     with pytest.raises(InputError, match="was not there at visit 2"):
         gmap.get(number("mug"))
+
+
+def test_a_name_of_a_gone_thing_is_known_without_any_encoder(tmp_path: Path) -> None:
+    gmap = read_map(write_visited_map(tmp_path / "a.gsmap"))
+    gmap.language = {}
+    write_map(tmp_path / "a.gsmap", gmap)
+    set_labels(tmp_path / "a.gsmap", {number("mug"): "my cup", number("lamp"): "my lamp"})
+    opened = load_map(tmp_path / "a.gsmap")
+    assert opened.query("My cup") == [] and [hit.instance_id for hit in opened.gone("My cup")] == [number("mug")]
+    assert [hit.instance_id for hit in opened.at(0).query("my cup")] == [number("mug")]
+    assert [hit.instance_id for hit in opened.query("my lamp")] == [number("lamp")] and opened.gone("my lamp") == []
+    with pytest.raises(InputError, match="no language"):
+        opened.query("cup")
 
 
 @pytest.mark.parametrize("name", [name for name in STATES if name != "mug"])
