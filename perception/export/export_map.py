@@ -163,6 +163,8 @@ def export_map(
     began = time.perf_counter()
     if cloud is None:
         rows, options = np.flatnonzero(gmap.opacities >= SURFACE_OPACITY), ExportOptions(smooth=False)
+        if not len(rows):
+            raise InputError(f"{map_path}: has no surface: none of its Gaussians has an opacity of {SURFACE_OPACITY}")
         cloud = PointCloud(means[rows], rgb8_from_sh(gmap.sh[rows, 0]))
         labels = ids[rows].astype(np.int32)
     else:
@@ -271,7 +273,7 @@ def check_overlap(means: np.ndarray, points: np.ndarray) -> float:
     InputError when the two bounding boxes do not overlap: the cloud has another frame or unit."""
     finite = points[np.isfinite(points).all(axis=1)]
     if len(finite) == 0:
-        raise InputError("cloud: all coordinates are NaN or infinite; nothing can be labelled")
+        raise InputError(f"cloud: of its {len(points)} points none is finite; nothing can be labelled")
     means = means[np.isfinite(means).all(axis=1)]
     if len(means) == 0:
         raise InputError("map: holds no Gaussians; nothing can be labelled")

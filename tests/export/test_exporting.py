@@ -81,6 +81,14 @@ def test_the_largest_distance_is_in_map_units_whatever_the_unit_of_the_scan(tmp_
         ExportOptions(max_distance=-1)
 
 
+def test_a_map_without_a_surface_is_told(tmp_path: Path) -> None:
+    gmap = small_map(60)
+    gmap.opacity_logits[:] = -9
+    write_map(tmp_path / "m.gsmap", gmap)
+    with pytest.raises(InputError, match=r"m\.gsmap: has no surface"):
+        export_map(tmp_path / "m.gsmap", tmp_path / "out.ply", None, ExportOptions())
+
+
 def test_what_is_gone_has_no_splat(tmp_path: Path) -> None:
     path = write_visited_map(tmp_path / "a.gsmap")
     facts, _ = export_splat(path, tmp_path / "s.ply", each=True)

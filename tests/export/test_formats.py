@@ -72,8 +72,9 @@ def test_a_cloud_in_another_frame_is_told_with_its_distance():
         check_overlap(cloud.points + np.array([10, 0, 0]), cloud.points)
     with pytest.raises(InputError, match="no Gaussians"):
         check_overlap(np.full((2, 3), np.nan), cloud.points)
-    with pytest.raises(InputError, match="NaN or infinite"):
-        check_overlap(cloud.points, np.full((3, 3), np.nan))
+    for nothing, count in ((np.full((3, 3), np.nan), 3), (np.zeros((0, 3)), 0)):
+        with pytest.raises(InputError, match=f"of its {count} points none is finite"):
+            check_overlap(cloud.points, nothing)
 
 
 def test_one_point_and_duplicated_points_are_exported():
