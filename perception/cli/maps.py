@@ -91,7 +91,7 @@ def _query(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.map.outputs import refuse_inputs
     from perception.query import load_map
     from perception.query.hit import answer_json
-    from perception.report.text import guessed_names, query_text, write_hits
+    from perception.report.text import names_of, query_text, write_hits
 
     refuse_inputs([args.points], [args.map])
     opened = load_map(args.map)
@@ -104,18 +104,18 @@ def _query(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     if args.points:
         write_hits(args.points, [hit for _, hits, _ in answers for hit in hits])
     results = [answer_json(*answer) for answer in answers]
-    guessed = {} if args.json or of_store else guessed_names(opened)
-    shown = query_text(answers, opened.metric, guessed, opened.visits)
+    names = {} if args.json or of_store else names_of(opened)
+    shown = query_text(answers, opened.metric, names, opened.visits)
     return {"results": results, "frame": opened.frame, "metric": opened.metric, **opened.visits_json()}, shown
 
 
 def _changes(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.query import load_map
-    from perception.report.text import changes_text, guessed_names
+    from perception.report.text import changes_text, names_of
 
     opened = load_map(args.map)
     facts = opened.changes_json(args.since)
-    return facts, "" if args.json else changes_text(opened, facts["since"], guessed_names(opened))
+    return facts, "" if args.json else changes_text(opened, facts["since"], names_of(opened))
 
 
 def _index(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

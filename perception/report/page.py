@@ -34,7 +34,7 @@ from perception.progress import Progress
 from perception.query import QueryMap, load_map
 from perception.query.crops import cut_out
 from perception.query.hit import printed_texts
-from perception.report.text import changes_parts, depth_figures, guessed_names
+from perception.report.text import changes_parts, depth_figures, names_of
 from perception.types import OrientedBox
 
 SHOWN = ("worst", "middle", "best")
@@ -309,7 +309,7 @@ def _changes(opened: QueryMap, album: _Album) -> dict[str, Any]:
     if not opened.newest_visit:
         return {}
     since = opened.newest_visit - 1
-    title, rows, rest = changes_parts(opened, since, guessed_names(opened))
+    title, rows, rest = changes_parts(opened, since, names_of(opened))
     entries, shown = {entry["id"]: entry for entry in opened.record.instances}, []
     for change, cells in rows:
         entry = entries[change["instance_id"]]

@@ -138,12 +138,12 @@ def depth_text(errors: dict[str, Any]) -> str:
 def query_text(
     answers: Sequence[tuple[str, list[Hit], list[Hit]]],
     metric: bool | None,
-    guessed: Mapping[int, str] | None = None,
+    names: Mapping[int, str] | None = None,
     visits: Sequence[Visit] = (),
 ) -> str:
     """Ranked hits of each prompt in aligned columns, or "not present", and what answers it and is gone. metric: whether
-    positions are in metres. guessed: instance id -> likely name, for instances that nobody has named."""
-    lines, names = [], guessed or {}
+    positions are in metres. names: of `names_of`."""
+    lines, names = list[str](), names or {}
     for text, hits, gone in answers:
         lines.append(f'"{text}": {f"{len(hits)} found" if hits else "not present"}')
         rows = [_hit_row(f"{rank}.", hit, metric, names, visits) for rank, hit in enumerate(hits, start=1)]
@@ -157,17 +157,17 @@ def _aligned(rows: list[list[str]]) -> list[str]:
     return ["  " + "  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
 
 
-def guessed_names(opened: QueryMap) -> dict[int, str]:
-    """Instance id -> likeliest name, also of what is gone; empty without an encoder."""
+def names_of(opened: QueryMap) -> dict[int, str]:
+    """Instance id -> the label that the user gave it, else with an encoder its likeliest name, called guessed; also of
+    what is gone."""
     known = opened.last_known
-    if known.problem is not None:
-        return {}
-    pairs = zip(known.instances, known.likely_names(1), strict=True)
-    return {int(entry["id"]): names[0] for entry, names in pairs if names}
+    likely = [[] for _ in known.instances] if known.problem is not None else known.likely_names(1)
+    guessed = {int(e["id"]): f"{names[0]} (guessed)" for e, names in zip(known.instances, likely, strict=True) if names}
+    return guessed | {int(entry["id"]): entry["label"] for entry in known.instances if entry.get("label")}
 
 
-def _name(instance_id: int, label: str | None, guessed: Mapping[int, str]) -> str:
-    return label or (f"{guessed[instance_id]} (guessed)" if instance_id in guessed else "no name")
+def _name(instance_id: int, label: str | None, names: Mapping[int, str]) -> str:
+    return label or names.get(instance_id, "no name")
 
 
 def _position(point: Sequence[float] | np.ndarray, metric: bool | None) -> str:
@@ -175,31 +175,29 @@ def _position(point: Sequence[float] | np.ndarray, metric: bool | None) -> str:
     return f"{x:.2f} {y:.2f} {z:.2f} m" if metric else f"{x:.3f} {y:.3f} {z:.3f}"
 
 
-def _hit_row(
-    rank: str, hit: Hit, metric: bool | None, guessed: Mapping[int, str], visits: Sequence[Visit]
-) -> list[str]:
+def _hit_row(rank: str, hit: Hit, metric: bool | None, names: Mapping[int, str], visits: Sequence[Visit]) -> list[str]:
     """Rank, name, score, position, size, id and visits of a hit, as the cells of a row."""
     in_metres = metric if hit.metric is None else hit.metric
-    name = _name(hit.instance_id, hit.label, guessed)
+    name = _name(hit.instance_id, hit.label, names)
     scale, unit = (100.0, " cm") if in_metres else (1.0, "")
     sides = " x ".join(f"{scale * side:.{0 if in_metres else 3}f}" for side in hit.obb.extent)
     ident = f"instance {hit.instance_id}"
     ident += "" if hit.part is None else f", part {hit.part}"
     ident += f", together {', '.join(map(str, hit.instances))}" if hit.instances else ""
     ident += "" if hit.map is None else f" in {hit.map}"
-    history = [] if hit.state is None or not visits else _history(hit, in_metres, guessed, visits)
+    history = [] if hit.state is None or not visits else _history(hit, in_metres, names, visits)
     position = f"{'stood' if hit.state == 'removed' else 'at'} {_position(hit.centroid, in_metres)}"
     return [rank, name, f"score {hit.score:.2f}", position, f"size {sides}{unit}", ident, "; ".join(history)]
 
 
-def _history(hit: Hit, metric: bool | None, guessed: Mapping[int, str], visits: Sequence[Visit]) -> list[str]:
+def _history(hit: Hit, metric: bool | None, names: Mapping[int, str], visits: Sequence[Visit]) -> list[str]:
     """What the visits tell of a hit: since when it is there or gone, where it was, when it was seen last."""
     since, newest, phrases = date_of(visits, hit.since or 0), len(visits) - 1, []
     if hit.state == "removed":
         phrases.append(f"gone since {since}")
         if hit.stood is not None:
             relation, other = hit.stood
-            phrases[-1] += f", stood {relation} {_name(other, None, guessed)} (instance {other})"
+            phrases[-1] += f", stood {relation} {_name(other, None, names)} (instance {other})"
     elif hit.was is not None:
         phrases.append(f"here since {since}, before at {_position(hit.was, metric)}")
     elif hit.state == "added":
@@ -215,32 +213,32 @@ def state_counts(changes: Sequence[Mapping[str, Any]]) -> str:
     return ", ".join(f"{counts[state]} {state.replace('unseen', 'not looked at')}" for state in STATES)
 
 
-def changes_text(opened: QueryMap, since: int, guessed: Mapping[int, str]) -> str:
+def changes_text(opened: QueryMap, since: int, names: Mapping[int, str]) -> str:
     """What changed since a visit, as a table, and what nobody looked at."""
     if len(opened.visits) == 1:
         return f"{opened.path}: has one visit, so nothing is known to have changed; perception update adds another"
-    title, rows, rest = changes_parts(opened, since, guessed)
+    title, rows, rest = changes_parts(opened, since, names)
     return "\n".join([f"{opened.path}: {title}", *_aligned([row for _, row in rows]), *rest])
 
 
 def changes_parts(
-    opened: QueryMap, since: int, guessed: Mapping[int, str]
+    opened: QueryMap, since: int, names: Mapping[int, str]
 ) -> tuple[str, list[tuple[dict[str, Any], list[str]]], list[str]]:
     """Dates and counts; each change with its cells; and lines with what nobody looked at and what is as it was."""
     changes, visits = opened.changes(since), opened.visits
     title = f"{date_of(visits, len(visits) - 1)} against {date_of(visits, since)}: {state_counts(changes)}"
-    rows = [(c, _change_row(c, opened.metric, guessed, visits)) for c in changes if c["state"] in CHANGED]
+    rows = [(c, _change_row(c, opened.metric, names, visits)) for c in changes if c["state"] in CHANGED]
     lines = []
     for state, heading in (("unseen", "not looked at"), ("unchanged", "unchanged")):
         rest = [c for c in changes if c["state"] == state]
-        names = [f"{_name(c['instance_id'], c['label'], guessed)} [{c['instance_id']}]" for c in rest]
+        told = [f"{_name(c['instance_id'], c['label'], names)} [{c['instance_id']}]" for c in rest]
         seen = [f", last seen {date_of(visits, c['last_seen'])}" if state == "unseen" else "" for c in rest]
-        lines += [f"{heading}: " + "; ".join(map(str.__add__, names, seen))] if rest else []
+        lines += [f"{heading}: " + "; ".join(map(str.__add__, told, seen))] if rest else []
     return title, rows, lines
 
 
 def _change_row(
-    change: Mapping[str, Any], metric: bool | None, guessed: Mapping[int, str], visits: Sequence[Visit]
+    change: Mapping[str, Any], metric: bool | None, names: Mapping[int, str], visits: Sequence[Visit]
 ) -> list[str]:
     """State, name, id, confidence, positions and dates of a change, as the cells of a row."""
     old, new, number = change["old_centroid"], change["new_centroid"], change["instance_id"]
@@ -260,7 +258,7 @@ def _change_row(
         parts.append(f"last seen {date_of(visits, change['last_seen'])}")
     sure = "" if change["confidence"] is None else f"confidence {change['confidence']:.2f}"
     note = "cannot be told from another thing or motion" if change.get("ambiguous") else ""
-    name = _name(number, change["label"], guessed)
+    name = _name(number, change["label"], names)
     return [change["state"], name, f"instance {number}", sure, ", ".join(parts), note]
 
 

@@ -85,7 +85,9 @@ def test_a_gone_thing_is_no_hit_and_is_named(gmap: QueryMap) -> None:
         gmap.get(number("mug"))
 
 
-def test_a_name_of_a_gone_thing_is_known_without_any_encoder(tmp_path: Path) -> None:
+def test_a_name_of_a_gone_thing_is_known_without_any_encoder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     gmap = read_map(write_visited_map(tmp_path / "a.gsmap"))
     gmap.language = {}
     write_map(tmp_path / "a.gsmap", gmap)
@@ -94,6 +96,9 @@ def test_a_name_of_a_gone_thing_is_known_without_any_encoder(tmp_path: Path) -> 
     assert opened.query("My cup") == [] and [hit.instance_id for hit in opened.gone("My cup")] == [number("mug")]
     assert [hit.instance_id for hit in opened.at(0).query("my cup")] == [number("mug")]
     assert [hit.instance_id for hit in opened.query("my lamp")] == [number("lamp")] and opened.gone("my lamp") == []
+    set_labels(tmp_path / "a.gsmap", {number("shelf"): "grandma's shelf"})
+    assert main(["query", str(tmp_path / "a.gsmap"), "my cup"]) == 0
+    assert "stood on grandma's shelf (instance 17)" in capsys.readouterr().out
     with pytest.raises(InputError, match="no language"):
         opened.query("cup")
 

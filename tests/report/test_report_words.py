@@ -32,7 +32,7 @@ def hit_of(instance_id: int, x: float, label: str | None = None) -> Hit:
 
 def test_answers_stand_in_columns_with_their_names_and_units() -> None:
     hits = [hit_of(3, 1.0, "grandma's cup"), hit_of(12, -10.5), hit_of(7, 0.0)]
-    lines = query_text([("mug", hits, []), ("dragon", [], [])], True, {12: "coffee mug"}).splitlines()
+    lines = query_text([("mug", hits, []), ("dragon", [], [])], True, {12: "coffee mug (guessed)"}).splitlines()
     assert lines[0] == '"mug": 3 found' and lines[-1] == '"dragon": not present'
     rows = lines[1:4]
     assert [row.split()[1] for row in rows] == ["grandma's", "coffee", "no"]
