@@ -1,4 +1,4 @@
-"""Maps inputs with another commit and with this one in turns: CPU and wall seconds, PSNR, SSIM, AP, peak memory.
+"""Maps inputs with another commit and this one in turns: CPU and wall seconds, PSNR, SSIM, AP, peak memory.
 
 python tools speed.turns OTHER INPUT ... [--seeds 0 1 2] [--threads N] [--masks NAME] [--set KEY=VALUE] [-o OUTPUT]
 
