@@ -66,8 +66,9 @@ OUTLINED = 0.5
 """Least IoU of a new thing with masks of the photos, relative to the median of those that stand where they stood."""
 
 
-LOOKED_AT = 0.1
-"""Share of a new thing's place from which an earlier photo looked there."""
+LOOKED_AT = 0.3
+"""Share of a new thing's place from which earlier photos looked there: of 24 things that came in made scenes .7 and
+more."""
 
 New = Literal["added", "known", "hidden"]
 """Of what the map has no instance: it came, the map showed it and did not know it as a thing, or no photo looked there
