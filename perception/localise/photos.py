@@ -30,22 +30,27 @@ NO_POINTS = np.zeros((1, 3)), np.zeros((1, 3), np.uint8)
 
 def new_photos(sources: Sequence[Path], camera: Path | None, workdir: Path, progress: Progress) -> list[NewPhoto]:
     """The photos of files and inputs, in their order, with unique names. camera: ROS camera_info of all that come
-    without a lens. InputError for a source that cannot be read, or holds no photo."""
+    without a lens. InputError for a source that cannot be read, or holds no photo, and where none comes without."""
     lens = None if camera is None else read_camera(camera)
-    found: list[NewPhoto] = []
+    found, unused = list[NewPhoto](), camera
     for source in sources:
         if source.suffix.lower() in SUFFIXES and source.is_file():
             found.append(NewPhoto(source.name, source))
+            unused = None
         elif source.suffix.lower() in VIDEO_SUFFIXES and source.is_file():
             raise InputError(f"{source}: is a video; localise takes photos, such as frames of it")
         elif (reader := reader_of(source)).poses:
             options = ReadOptions(workdir, progress=progress, poses="keep", cloud=NO_POINTS, lens=lens)
             views = reader.read(source, options).views
             found += [NewPhoto(v.name, v.photo, view_lens(v), v.depth, v.mask, v.as_stored) for v in views]
+            unused = unused if reader.cameras else None
         elif photos := list_photos(source):
             found += [NewPhoto(view_name(photo, source), photo) for photo in photos]
+            unused = None
         else:
             raise InputError(f"{source}: no photos found; expected .jpg, .heic, .png, .tif, .bmp or .webp files")
+    if unused is not None:
+        raise InputError(f"{unused}: a camera file goes with photos; {sources[0]} brings its own cameras")
     if lens is not None:
         found = [p if p.lens else replace(p, lens=_fitted(lens, p.photo, camera)) for p in found]
     names = [photo.name for photo in found]

@@ -46,8 +46,8 @@ def lens_of(data: Any, where: object) -> Lens:
     values = _data(data, "distortion_coefficients")
     found = len(values) if isinstance(values, (list, tuple)) else -1
     if found not in _COUNTS:
-        expected = ", ".join(map(str, _COUNTS))
-        raise InputError(f"{where}: expected {expected} distortion_coefficients, found {max(found, 0)}")
+        expected, told = ", ".join(map(str, _COUNTS)), found if found >= 0 else "no list of them"
+        raise InputError(f"{where}: expected {expected} distortion_coefficients, found {told}")
     k = _numbers(values, found, where, "distortion_coefficients.data").tolist()
     if any(k[len(names) :]):
         known = f"the first {len(names)} coefficients of {name} may differ from 0"

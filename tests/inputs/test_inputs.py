@@ -188,6 +188,12 @@ def test_camera_file_against_opencv(tmp_path):
     np.testing.assert_allclose(camera_from_lens(lens).img_from_cam(ray)[0], expected[0, 0] + 0.5, atol=1e-9)
 
 
+def test_a_camera_file_without_distortion_says_that_it_is_missing(tmp_path):
+    (tmp_path / "camera.yaml").write_text(CAMERA.partition("distortion_coefficients")[0])
+    with pytest.raises(InputError, match="14 distortion_coefficients, found no list of them"):
+        read_camera(tmp_path / "camera.yaml")
+
+
 def test_exif_grey_sixteen_bit_and_alpha(tmp_path):
     exif = Image.Exif()
     exif[0x0112] = 6

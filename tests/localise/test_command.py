@@ -22,6 +22,7 @@ from perception.localise.photos import new_photos
 from perception.map.files import MapFiles
 from perception.map.map import Map
 from perception.map.write import read_map, write_map
+from perception.photos.camera_file import camera_data
 from perception.photos.lens import camera_from_lens
 from perception.photos.view_json import unit_of
 from perception.progress import QUIET
@@ -120,6 +121,8 @@ def test_what_cannot_be_used_is_told_in_one_line(
     (tmp_path / "broken.png").write_bytes(b"no picture")
     (tmp_path / "video.mp4").write_bytes(b"")
     write_room(tmp_path / "splat.ply", room_columns()[0])
+    camera = camera_data("camera", (400, 300), "plumb_bob", [FOCAL, 0, 200, 0, FOCAL, 150, 0, 0, 1], [])
+    (tmp_path / "camera.yaml").write_text(json.dumps(camera))
     (tmp_path / "empty").mkdir()
     photo, poses = folder / "new/0.png", tmp_path / "posed" / "transforms.json"
     shutil.copytree(folder / "new", tmp_path / "posed")
@@ -137,6 +140,7 @@ def test_what_cannot_be_used_is_told_in_one_line(
         ([tmp_path / "posed", "-o", poses], "write to another file"),
         ([photo, "--photos", tmp_path / "nowhere"], "is no folder"),
         ([photo, "--camera", tmp_path / "nowhere.yaml"], "nowhere.yaml"),
+        ([tmp_path / "posed", "--camera", tmp_path / "camera.yaml"], "posed brings its own cameras"),
     ):
         assert main(["localise", str(folder / "a.gsmap"), *map(str, arguments)]) == 2
         lines = capsys.readouterr().err.strip().splitlines()
