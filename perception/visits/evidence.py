@@ -18,7 +18,7 @@ from perception.gaussians.model import Gaussians
 from perception.gaussians.views import TrainingView, depth_image
 from perception.photos.decode import scaled_K, scaled_size
 from perception.types import View
-from perception.visits.look import Look, correlation, projected
+from perception.visits.look import Look, correlation
 
 AGREE = 0.03
 """Relative difference of depths up to which two are of one surface: the noise of stereo."""
@@ -180,25 +180,16 @@ def signs_from(row: np.ndarray, share: float) -> Signs:
     return Signs(int(photos), int(pixels), share, known, *means, a / max(b, 1e-12), rays / max(pixels, 1))
 
 
-def _inside(view: TrainingView, means: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Of points [N, 3]: numbers [M] of those in the picture, their (rows [M], columns [M]), and depths [M]."""
-    pixel, z = projected(view, means)
-    height, width = view.photo.shape[:2]
-    column, row = np.clip(np.floor(pixel), -1, 1 << 30).astype(np.int64).T
-    inside = np.flatnonzero((z > 1e-6) & (column >= 0) & (row >= 0) & (column < width) & (row < height))
-    return inside, (row[inside], column[inside]), z[inside]
-
-
 def seen_rows(looks: Sequence[Look], means: np.ndarray, scales: np.ndarray) -> np.ndarray:
     """[N] bool: Gaussians (means [N, 3], largest scales [N]) whose centre some photo sees: at the map's surface, with
     nothing measured in front of it."""
     seen = np.zeros(len(means), bool)
     for shown in looks:
-        inside, pixel, z = _inside(shown.view, means)
-        mapped, measured = shown.mapped[pixel], shown.measured[pixel]
+        inside, (row, column), z = shown.view.seen(means)
+        mapped, measured = shown.mapped[row, column], shown.measured[row, column]
         limit = (1 + AGREE) * mapped + 2 * scales[inside]
-        free = (measured == 0) | (measured > (1 - 2 * AGREE) * z - 2 * scales[inside])
-        seen[inside[(mapped > 0) & (z <= limit) & free]] = True
+        free = (measured == 0) | (measured > (1 - 2 * AGREE) * z[inside] - 2 * scales[inside])
+        seen[inside[(mapped > 0) & (z[inside] <= limit) & free]] = True
     return seen
 
 
@@ -206,24 +197,23 @@ def in_free_space(looks: Sequence[Look], means: np.ndarray) -> np.ndarray:
     """[N] bool: points [N, 3] behind which LOOKED photos measured a surface."""
     counts = np.zeros(len(means), int)
     for shown in looks:
-        inside, pixel, z = _inside(shown.view, means)
-        counts[inside] += shown.measured[pixel] > (1 + 2 * AGREE) * z
+        inside, (row, column), z = shown.view.seen(means)
+        counts[inside] += shown.measured[row, column] > (1 + 2 * AGREE) * z[inside]
     return counts >= LOOKED
 
 
-def looked_at(gaussians: Gaussians, views: Sequence[View], points: np.ndarray) -> np.ndarray:
-    """[P] bool: points [P, 3] that LOOKED views looked at, nothing of the Gaussians being in front of them."""
-    counts = np.zeros(len(points), int)
+def looked_at(gaussians: Gaussians, views: Sequence[View], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two [P] bool: points [P, 3] that LOOKED views looked at, nothing of the Gaussians being in front of them; those
+    that so many saw through, to a surface behind."""
+    looked, through = np.zeros(len(points), int), np.zeros(len(points), int)
     for view in views:
         width, height = scaled_size(view, ROUGH)
-        K, pose = scaled_K(view, width, height), np.asarray(view.camera_from_world, np.float64)
-        local = points @ pose[:3, :3].T + pose[:3, 3]
-        pixel = local[:, :2] / np.maximum(local[:, 2:], 1e-6) * np.diag(K)[:2] + K[:2, 2]
-        column, row = np.clip(np.floor(pixel), -1, 1 << 30).astype(np.int64).T
-        inside = (local[:, 2] > 1e-6) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
-        inside &= counts < LOOKED
-        if inside.any():
-            camera, lens = (torch.from_numpy(each.astype(np.float32)) for each in (pose, K))
-            mapped = depth_image(gaussians, camera, lens, width, height).numpy()[row[inside], column[inside]]
-            counts[inside] += (mapped == 0) | (local[inside, 2] <= (1 + AGREE) * mapped)
-    return counts >= LOOKED
+        matrices = view.camera_from_world, scaled_K(view, width, height)
+        camera, K = (torch.from_numpy(matrix.astype(np.float32)) for matrix in matrices)
+        seen = TrainingView(view.name, torch.zeros(height, width, 3, dtype=torch.uint8), None, K, camera)
+        inside, (row, column), z = seen.seen(points)
+        if len(inside):
+            mapped = depth_image(gaussians, camera, K, width, height).numpy()[row, column]
+            looked[inside] += (mapped == 0) | (z[inside] <= (1 + AGREE) * mapped)
+            through[inside] += mapped > (1 + 2 * AGREE) * z[inside]
+    return looked >= LOOKED, through >= LOOKED

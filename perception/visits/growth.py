@@ -13,6 +13,7 @@ from perception.gaussians.depth_start import start_on_surface
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.state import USUAL_PHOTOS, TrainRecord, sized
 from perception.gaussians.train import Trainer
+from perception.gaussians.views import TrainingView
 from perception.instances.assign import LEAST_AGREEMENT, affinities, mask_shares
 from perception.instances.group import Grouping, group
 from perception.masks.votes import MaskVotes
@@ -78,13 +79,21 @@ def update_config(config: MapConfig, photos: int, share: float, start: int) -> M
 
 
 def trained(
-    run: Run, leg: str, mark: str, masks: str, gaussians: Gaussians, held: int, photos: Photos, config: MapConfig
+    run: Run,
+    leg: str,
+    mark: str,
+    masks: str,
+    gaussians: Gaussians,
+    held: int,
+    photos: Photos,
+    rehearsed: Sequence[TrainingView],
+    config: MapConfig,
 ) -> tuple[Gaussians, TrainRecord]:
-    """Trains one leg, from its checkpoint on if there is one: all of the Gaussians beyond the first `held` rows, and
-    the colours of those. On the CPU."""
+    """Trains one leg on the photos and on what is `rehearsed`, from its checkpoint on if there is one: all of the
+    Gaussians beyond the first `held` rows, and the colours of those. On the CPU."""
     work = run.work / f"leg-{leg}"
     work.mkdir(exist_ok=True)
-    trainer = Trainer(gaussians, photos.views, config, photos.held, run.device, held=held)
+    trainer = Trainer(gaussians, [*photos.views, *rehearsed], config, photos.held, run.device, held=held)
     trainer.stopping.degree_decided = True  # the map's
     observer = TrainingObserver(work, mark, masks, 0.0, run.progress)
     observer.take_up(trainer)

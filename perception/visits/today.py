@@ -117,7 +117,8 @@ def seen_today(visit: Visit) -> Today:
     grown, record = held, TrainRecord()
     if len(new):
         both, mark = Gaussians.concatenate([held, new]), visit.masks["identity"]
-        grown, record = trained(run, "grow", visit.mark, mark, both, len(held), visit.photos, config)
+        memory = visit.rehearsed(held, Gaussians.concatenate([visit.part(np.isin(visit.ids, gone)), new]))
+        grown, record = trained(run, "grow", visit.mark, mark, both, len(held), visit.photos, memory, config)
 
     with run.stage("instances"):
         rows = np.arange(len(held), len(grown))
@@ -297,8 +298,8 @@ def _settled(
     pieces: set[int],
     record: TrainRecord,
 ) -> Today:
-    """Puts the Gaussians of moved things where the new ones grew, leaves `pieces` of them out, and trains the colours
-    of all that was looked at."""
+    """Puts the Gaussians of moved things where the new ones grew, leaves out `pieces` of them and new surface through
+    which earlier photos saw, unless it is of a thing, and trains the colours of all that was looked at."""
     gmap, run = visit.gmap, visit.run
     membership = np.concatenate([gmap.membership[kept], np.ones(len(grown) - len(kept), np.float32)])
     membership[free] = np.where(made.ids >= 0, made.membership, 0)
@@ -307,13 +308,16 @@ def _settled(
     taken = {j for j, _ in pairs.values()} | pieces
     used = [entry["id"] for entry in gmap.instances] + [p["id"] for e in gmap.instances for p in e.get("parts", ())]
     following, added = max(used, default=-1) + 1, dict[int, tuple[float, New]]()
-    means, whole = grown.means.double().numpy(), as_gaussians(gmap)
+    fresh = np.arange(len(kept), len(grown))
+    looked, through = looked_at(as_gaussians(gmap), gmap.views, grown.means[fresh].double().numpy())
     for j, (rows, score) in enumerate(things):
         if j not in taken and score >= LEAST_SCORE:
-            hidden = bool(gmap.views) and looked_at(whole, gmap.views, means[rows]).mean() < LOOKED_AT
+            hidden = bool(gmap.views) and looked[rows - len(kept)].mean() < LOOKED_AT
             ids[rows], added[following] = following, (score, "known" if j in old else "hidden" if hidden else "added")
             following += 1
-    stays = np.setdiff1d(np.arange(len(grown)), _rows(things, taken))
+    own = np.isin(fresh, _rows(things, set(range(len(things)))))  # other new surface stands where nothing did: an error
+    stays = np.setdiff1d(np.arange(len(grown)), np.append(_rows(things, taken), fresh[through & ~own]))
+    came = [np.isin(stays, fresh[own])]
     placed, names, members, owned = (
         [grown.rows(torch.from_numpy(stays))],
         [ids[stays]],
@@ -326,14 +330,18 @@ def _settled(
         hues.append(visit.hues(visit.own(i)))
         placed.append(carried(visit.thing(i), motion.new_from_old))
         names.append(np.full(len(placed[-1]), i, np.int32))
+        came.append(np.ones(len(placed[-1]), bool))
         back = i in visit.away  # without rows in the map
         members.append(np.ones(len(names[-1]), np.float32) if back else gmap.membership[own])
         owned.append(np.full(len(names[-1]), -1, np.int32) if back else parts[own])
     together = Gaussians.concatenate(placed)
     config = update_config(run.config, len(visit.photos.views), SETTLING, len(together))
     start = together.sh.clone()
+    new = together.rows(torch.from_numpy(np.flatnonzero(np.concatenate(came))))
+    others = Gaussians.concatenate([visit.part(np.isin(visit.ids, gone)), new])
+    memory = visit.rehearsed(visit.part(np.isin(visit.rows, kept)), others)
     final, last = trained(
-        run, "settle", visit.mark, visit.masks["identity"], together, len(together), visit.photos, config
+        run, "settle", visit.mark, visit.masks["identity"], together, len(together), visit.photos, memory, config
     )
     unseen = (final.sh[: len(kept)] == start[: len(kept)]).flatten(1).all(dim=1)
     final = in_grey(final) if visit.grey else final

@@ -60,10 +60,11 @@ def update_map(
 ) -> Map:
     """Writes the map of today to `output`: the map at `path`, changed as the photos of `source` show.
 
-    config: settings, usually those of the map (`update_settings`). Gaussians that no photo looked at stay as they are,
-    bit for bit; of the others that stay, colours alone are trained. Ids, names and the frame are kept. What a run has
-    made is kept beside `output` until the map is written; `resume` goes on from there. InputError for bad input:
-    another scene, another unit, photos older than the map, masks of another kind. The map at `path` is only read.
+    config: settings, usually those of the map (`update_settings`). Gaussians that lie in no photo stay as they are, bit
+    for bit; of the others that stay, colours alone are trained, on the photos and on renders of what earlier visits saw
+    (`rehearsal`). Ids, names and the frame are kept. What a run has made is kept beside `output` until the map is
+    written; `resume` goes on from there. InputError for bad input: another scene, another unit, photos older than the
+    map, masks of another kind. The map at `path` is only read.
     """
     check_name(output)
     gmap = read_map(path)

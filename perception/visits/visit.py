@@ -34,8 +34,11 @@ from perception.visits.look import (
 from perception.visits.placing import checked_poses
 from perception.visits.record import as_it_was
 from perception.visits.registration import compact
+from perception.visits.rehearsal import rehearsed
 from perception.visits.scene import foreign_photos, refuse_older, visit_scene
 
+MOST = 64
+"""Renders of what earlier visits saw: half a megapixel each."""
 TENSORS = ("means", "quats", "log_scales", "opacity_logits", "sh", "features")
 """Of `Gaussians`, and fields of a map."""
 
@@ -70,6 +73,15 @@ class Visit:
     def ids(self) -> np.ndarray:
         """[R] int32 instance of each of `gaussians`, −1 = none."""
         return self.gmap.instance_ids[self.rows]
+
+    def part(self, chosen: np.ndarray) -> Gaussians:
+        """The rows of `gaussians` for which `chosen` [R] bool holds."""
+        return self.gaussians.rows(torch.from_numpy(np.flatnonzero(chosen)))
+
+    def rehearsed(self, stays: Gaussians, others: Gaussians) -> list[TrainingView]:
+        """As many renders of what earlier visits saw as there are photos, or MOST, see `rehearsal.rehearsed`."""
+        count = min(MOST, len(self.photos.views))
+        return rehearsed(self.gmap.views, self.run.config.photos.max_side, count, stays, others)
 
     def rows_of(self, instance: int) -> np.ndarray:
         """[R] rows of the map's Gaussians of an instance that are no strays."""

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from perception.gaussians.model import Gaussians, from_points
-from perception.gaussians.views import TrainingView
+from perception.gaussians.views import TrainingView, render
 from perception.types import View
 from perception.visits.evidence import in_free_space, looked_at, signs_of
 from perception.visits.look import Look, in_view
 from perception.visits.record import with_parts
+from perception.visits.rehearsal import rehearsed
 
 SHAPE = 40, 50
 BOX = np.s_[10:30, 10:40]
@@ -110,12 +113,12 @@ def test_parts_of_a_thing_that_moved_lie_where_it_stands() -> None:
     assert with_parts({"id": 4}, gaussians, part_ids) == {"id": 4}
 
 
-def test_a_place_was_looked_at_where_two_views_saw_it_before_the_wall() -> None:
-    """A wall at z = 2 up to y = 0.5 before cameras that look along z; exact sight lines."""
+def wall() -> Gaussians:
+    """A plain wall at z = 2 from x = -1 to 1 and y = -0.5 to 0.5."""
     x, y = torch.meshgrid(torch.linspace(-1, 1, 81), torch.linspace(-0.5, 0.5, 41), indexing="ij")
     grid = torch.stack([x, y, torch.full_like(x, 2.0)], dim=2).reshape(-1, 3)
     n = len(grid)
-    wall = Gaussians(
+    return Gaussians(
         means=grid,
         quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
         log_scales=torch.tensor([[0.02, 0.02, 0.002]]).log().repeat(n, 1),
@@ -123,14 +126,42 @@ def test_a_place_was_looked_at_where_two_views_saw_it_before_the_wall() -> None:
         sh=torch.zeros(n, 16, 3),
         features=torch.zeros(n, 2),
     )
-    K = np.array([[300.0, 0, 160], [0, 300.0, 120], [0, 0, 1]])
-    views = [View(str(x), Path(), K, 320, 240, np.eye(4) - np.eye(4, k=3) * x) for x in (-0.2, 0.2)]
+
+
+K = np.array([[300.0, 0, 160], [0, 300.0, 120], [0, 0, 1]])
+VIEWS = [View(str(x), Path(), K, 320, 240, np.eye(4) - np.eye(4, k=3) * x) for x in (-0.2, 0.2)]
+
+
+def test_a_place_was_looked_at_where_two_views_saw_it_before_the_wall() -> None:
+    """Exact sight lines of cameras that look along z."""
     points = np.array(
         [[0, 0, 1.0], [0.3, 0.2, 1.99], [0, 0, 2.5], [5, 0, 1.0], [0, 0, -1.0], [0.6, 0, 1.0], [0, 2, 6.0]]
     )
     # Of the last but one only the second view is near enough, |x - 0.2| < z 160 / 300; the last is seen past the wall.
-    assert looked_at(wall, views, points).tolist() == [True, True, False, False, False, False, True]
-    assert not looked_at(wall, views[:1], points).any()
+    looked, through = looked_at(wall(), VIEWS, points)
+    assert looked.tolist() == [True, True, False, False, False, False, True]
+    assert through.tolist() == [True, False, False, False, False, False, False], "to the wall, not on or past it"
+    assert not np.any(looked_at(wall(), VIEWS[:1], points))
+
+
+def test_what_is_rehearsed_is_the_render_but_where_something_new_stands_or_stood() -> None:
+    """A ball of 0.1 before the wall and one behind it: pixels of the first do not count, nor those past the wall."""
+    front, behind = (replace(wall().rows(torch.arange(1)), log_scales=torch.full((1, 3), -3.0)) for _ in range(2))
+    front.means[:], behind.means[:] = torch.tensor([0.1, 0.0, 1.0]), torch.tensor([0.1, 0.0, 3.0])
+    held: Any = SimpleNamespace(held_out=True)
+    both = rehearsed([*VIEWS, held], 160, 9, wall(), Gaussians.concatenate([front, behind]))
+    plain = rehearsed(VIEWS, 160, 1, wall(), behind)
+    assert [view.name for view in both] == ["rehearsed -0.2", "rehearsed 0.2"] and len(plain) == 1
+    row, column = np.mgrid[:120, :160] + 0.5
+    for view, x in zip(both, (-0.2, 0.2), strict=True):
+        away = np.hypot(column - 80 - 150 * (0.1 - x), row - 60) / 150  # at the depth of the ball
+        on_wall = (np.abs((row - 60) / 75) < 0.45) & (np.abs((column - 80) / 75 + x) < 0.95)
+        weight = view.weight.numpy()
+        assert (weight[on_wall & (away > 0.2)] == 1).all() and (weight[away < 0.1] == 0).all()
+        assert (weight[np.abs((row - 60) / 75) > 0.55] == 0).all()
+        image = render(wall(), view.camera_from_world, view.K, 160, 120, harmonics=True).colors[0]
+        assert np.abs(view.photo.numpy() / 255 - image.numpy()).max() < 0.003
+    assert (plain[0].weight.numpy()[(np.abs(row - 60) < 25) & (np.abs(column - 95) < 40)] == 1).all()
 
 
 def test_what_two_photos_see_through_is_free_space() -> None:

@@ -14,12 +14,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from perception.cli import main
 from perception.config import load_config
 from perception.errors import InputError
+from perception.gaussians.model import as_gaussians
+from perception.gaussians.views import render
 from perception.io.cloud import read_cloud
 from perception.map.history import changes_of, visits_of
 from perception.map.write import Map, read_map, write_map
@@ -27,6 +30,7 @@ from perception.pipeline.checkpoint import work_folder
 from perception.pipeline.mapping import build_map
 from perception.visits.scene import update_settings
 from perception.visits.update import update_map
+from perception.visits.visit import Visit
 from worlds.visits import make_visits
 
 pytestmark = pytest.mark.slow
@@ -131,6 +135,29 @@ def test_a_visit_with_a_grey_camera_leaves_the_colours(world: Path, new: Map) ->
     assert np.ptp(made.sh[np.setdiff1d(np.arange(len(made)), pairs[:, 0]), 0], axis=1).max() < 1e-3
     gone = [{e["id"] for e in m.instances if e["state"] == "removed"} for m in (made, new)]
     assert gone[0] == gone[1] != set()
+
+
+def test_an_update_keeps_what_earlier_visits_saw(world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A visit of one side: photos of the first visit, in whatever light, are shown better than by an update that
+    rehearses nothing."""
+    old, second, errors = world / "old.gsmap", world / "visit1", []
+    known = json.loads((second / "transforms.json").read_text())
+    frames = sorted(known["frames"], key=lambda frame: str(frame["file_path"]))[:5]
+    (second / "side.json").write_text(json.dumps({**known, "frames": frames}))
+    config = update_settings(old, None, [f"masks=labels:{second / 'labels'}"])
+    for name in ("side.gsmap", "forgetful.gsmap"):
+        gmap = update_map(old, second / "side.json", world / name, config)
+        gaussians, found = as_gaussians(gmap), []
+        for view in gmap.views:
+            if view.visit == 0:
+                photo = torch.from_numpy(cv2.imread(str(view.photo))[..., ::-1] / 255.0)
+                camera = (torch.from_numpy(a.astype(np.float32)) for a in (view.camera_from_world, view.K))
+                image = render(gaussians, *camera, view.width, view.height, harmonics=True).colors[0]
+                light = (image * photo).sum(dim=(0, 1)) / (image * image).sum(dim=(0, 1))
+                found.append(float((light * image - photo).abs().median()))  # most of it did not change
+        errors.append(np.mean(found))
+        monkeypatch.setattr(Visit, "rehearsed", lambda *_: [])
+    assert 0 < errors[0] < 0.95 * errors[1], errors
 
 
 def test_a_visit_without_changes_adds_nothing(world: Path) -> None:
