@@ -4,8 +4,8 @@ python tools score.unchanged WORK SCENE ... [--stretch N] [--set KEY=VALUE ...]
 
 SCENE: a folder with a transforms.json, of real photos too. Of its photos, by name, every other stretch of N (5) is the
 visit; the map of the others is made in WORK with the built-in masks and without language, and kept. Everything that the
-update says to have moved, gone or come is an error. A row for each scene, with the PSNR of held-out photos of the visit,
-and of those of the map, each in its own light, before and after the update.
+update says to have moved, gone or come is an error. A row for each scene, with the PSNR of held-out photos of the
+visit, and of those of the map, each in its own light, before and after the update.
 """
 
 from __future__ import annotations
