@@ -90,6 +90,10 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
                 shutil.rmtree(aside / "depth", ignore_errors=True)
                 source_of_depth = f"left out: {error}"
             known, fixed = _camera_poses(poses, stamps, frame, options.fixed_frame)
+            if fixed is None and options.fixed_frame is not None:
+                found = f"no image has a pose of '{frame}' in --fixed-frame '{options.fixed_frame}'"
+                above = ", ".join(poses.path(frame)[1:]) or "none"
+                raise InputError(f"{bag.path}: {found}; frames above '{frame}': {above}")
             down = None if fixed is None else gravity(bag, poses, fixed, frame)
             vertical: dict[str, Any] = {"gravity": None, "gravity_std_deg": None}
             if down is not None:

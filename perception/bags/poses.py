@@ -82,14 +82,15 @@ class Poses:
 
 
 def read_poses(bag: Bag) -> Poses:
-    """All transforms of a bag; odometry adds frames that tf does not define."""
-    poses = Poses()
+    """All transforms of a bag; odometry adds frames that tf does not define. Of several topics with poses of one frame
+    the first is taken: a filter on tf and wheel odometry differ."""
+    poses, topics = Poses(), dict[str, str]()
 
     def add(one: Recorded, entry: Any, child: str, position: Any, quaternion: Any, static: bool = False) -> None:
         matrix = _matrix(position, quaternion)
         if matrix is None:
             bag.leave_out(one.topic, one.number, f"the pose of '{child}' is not finite")
-        else:
+        elif topics.setdefault(child.lstrip("/"), one.topic) == one.topic:
             poses.add(entry.header.frame_id, child, stamp_of(entry), matrix, static)
 
     for one in bag.messages(bag.of_type(*TRANSFORMS)):

@@ -103,8 +103,40 @@ def test_poses_are_those_recorded(tmp_path: Path) -> None:
         assert lens.model == "OPENCV_FISHEYE" and lens == read_camera(tmp_path / "out" / "camera.yaml")
         kept = (tmp_path / "out" / name).read_bytes()
         assert kept == cv2.imencode(".jpg", photo(number))[1].tobytes()  # compressed images are not touched
-    plain, text = run_frames(tmp_path / "drive", tmp_path / "plain", FrameOptions(fixed_frame="nowhere"))
-    assert plain["with_pose"] == 0 and "--camera" in text and not (tmp_path / "plain" / "transforms.json").exists()
+
+
+def test_a_fixed_frame_without_poses_is_refused_and_others_are_named(tmp_path: Path) -> None:
+    bag = Recorder(tmp_path / "drive", "mcap")
+    bag.info("/camera_info", TIMES[0], (128, 96), K, D)
+    for i, time in enumerate(TIMES[:3]):
+        bag.jpeg("/compressed", time, cv2.imencode(".jpg", photo(i))[1].tobytes())
+        bag.transform("/tf", time, "odom", "cam", pose(0.1 * i, 0.2 * i))
+    bag.close()
+    with pytest.raises(InputError, match=r"'cam' in --fixed-frame 'odomm'; frames above 'cam': odom$"):
+        run_frames(tmp_path / "drive", tmp_path / "out", FrameOptions(fixed_frame="odomm"))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("tf", [True, False])
+def test_poses_of_one_frame_are_those_of_one_topic(tf: bool, tmp_path: Path) -> None:
+    """Wheel odometry goes astray between the samples of a filter on tf, or of another odometry."""
+    bag = Recorder(tmp_path / "drive", "mcap")
+    bag.info("/camera_info", TIMES[0], (128, 96), K, D)
+    bag.transform("/tf_static", TIMES[0], "base", "cam", BASE_FROM_CAM)
+    for i, time in enumerate(TIMES):
+        bag.jpeg("/compressed", time, cv2.imencode(".jpg", photo(i))[1].tobytes())
+        for near in (time - 20_000_000, time + 20_000_000):
+            if tf:
+                bag.transform("/tf", near, "odom", "base", pose(0.1 * i, 0.2 * i))
+            else:
+                bag.odometry("/filtered", near, pose(0.1 * i, 0.2 * i))
+        bag.odometry("/a/wheels", time - 10_000_000, pose(0.1 * i, 0.2 * i + 1))
+    bag.close()
+    run_frames(tmp_path / "drive", tmp_path / "out")
+    for name, camera_from_world, _ in read_frames(tmp_path / "out" / "transforms.json"):
+        number = int(Path(name).stem)
+        want = inverse_se3(pose(0.1 * number, 0.2 * number) @ BASE_FROM_CAM)
+        np.testing.assert_allclose(camera_from_world, want, atol=1e-9)
 
 
 @pytest.mark.parametrize("topic", ["/cam/image_rect", "/cam/image_rect_color/compressed", "/cam/image_raw/compressed"])
@@ -115,7 +147,8 @@ def test_rectified_images_take_the_camera_of_rectified_images(tmp_path: Path, to
     for i, time in enumerate(TIMES[:3]):
         bag.jpeg(topic, time, cv2.imencode(".jpg", photo(i))[1].tobytes())
     bag.close()
-    run_frames(tmp_path / "drive", tmp_path / "out")
+    plain, text = run_frames(tmp_path / "drive", tmp_path / "out")
+    assert plain["with_pose"] == 0 and "--camera" in text and not (tmp_path / "out" / "transforms.json").exists()
     params = np.array(read_camera(tmp_path / "out" / "camera.yaml").params)
     if "rect" in topic:  # the recorder writes P = .9 K
         np.testing.assert_allclose(
