@@ -5,6 +5,7 @@ All write pixel centres at whole numbers, so 0.5 is added to their principal poi
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +18,7 @@ from perception.geometry import interpolated_pose
 from perception.inputs.recordings import Frame, Recording
 from perception.io.documents import read_json, refusing, text_of
 from perception.photos.decode import open_photo, photo_size
+from perception.photos.folder import list_photos
 from perception.photos.lens import opencv_lens
 from perception.photos.named_files import NamedFiles
 from perception.types import Lens
@@ -71,15 +73,22 @@ def _color_folder(source: Path) -> Path | None:
 
 
 def refuse_depth_without_poses(source: Path) -> None:
-    """InputError for a folder of photos that holds 16-bit depth images, which would be taken for photos."""
-    for first in sorted((source / "depth").glob("*.png"))[:1]:
-        with open_photo(first) as image:
-            if not image.mode.startswith("I"):
-                return
+    """InputError for a folder of photos that holds 16-bit images named depth, which would be taken for photos."""
+    names = (path.relative_to(source).as_posix() for path in list_photos(source))
+    first = next((name for name in names if "depth" in name.lower() and _has_16_bits(source / name)), None)
+    if first is not None:
         raise InputError(
-            f"{source}: has depth images but no poses; expected transforms.json with depth_file_path, groundtruth.txt "
-            "(TUM), pose/*.txt (ScanNet) or a trajectory *.log (Redwood); to map the photos alone, give their folder"
+            f"{source}: has depth images ({first}) but no poses; expected transforms.json with depth_file_path, "
+            "groundtruth.txt (TUM), pose/*.txt (ScanNet) or a trajectory *.log (Redwood); to map the photos alone, "
+            "give a folder without depth"
         )
+
+
+def _has_16_bits(path: Path) -> bool:
+    """Whether an image is of one channel of 16 bits; not one that cannot be read."""
+    with contextlib.suppress(InputError), open_photo(path) as image:
+        return image.mode.startswith("I")
+    return False
 
 
 def _tum(source: Path) -> Recording:

@@ -106,6 +106,17 @@ def _later(source: Path) -> None:
     (source / "depth.txt").write_text("\n".join(f"{float(time) + 77} {name}" for time, name in rows))
 
 
+def _as_replica(source: Path) -> None:
+    """Photos and depth in one folder, poses in a traj.txt that is not read."""
+    (source / "wall.log").rename(source / "traj.txt")
+    (source / "results").mkdir()
+    for folder, kind in (("image", "frame"), ("depth", "depth")):
+        for file in list((source / folder).iterdir()):
+            file.rename(source / "results" / f"{kind}{file.name}")
+        (source / folder).rmdir()
+
+
+NO_POSES = r"has depth images \((depth|results)/[\w.]+\) but no poses"
 BAD = [
     ("tum", lambda s: (s / "groundtruth.txt").unlink(), "groundtruth.txt: missing"),
     ("tum", _later, "do rgb.txt and depth.txt use one clock"),
@@ -128,7 +139,8 @@ BAD = [
     ("redwood", lambda s: _edit(s / "wall.log", "11 11 12\n", "11 11 12\n9 "), "blocks of a line"),
     ("redwood", lambda s: (s / "b.log").write_text("0"), "several trajectories"),
     ("redwood", lambda s: (s / "camera_intrinsic.json").write_text("{}"), "Open3D's camera intrinsics"),
-    ("redwood", lambda s: (s / "wall.log").unlink(), "has depth images but no poses"),
+    ("redwood", lambda s: (s / "wall.log").unlink(), NO_POSES),
+    ("redwood", _as_replica, NO_POSES),
 ]
 
 
@@ -137,7 +149,7 @@ def test_bad_recordings_are_one_line(layout: str, damage, words: str, tmp_path: 
     source = write_recording(tmp_path, layout)
     damage(source)
     with pytest.raises(InputError, match=words) as caught:
-        if words == "has depth images but no poses":
+        if words == NO_POSES:
             load_scene(source, ReadOptions(tmp_path / "work"))
         loaded(source, tmp_path)
     assert "\n" not in str(caught.value)
