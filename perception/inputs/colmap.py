@@ -12,12 +12,13 @@ from perception.errors import InputError
 from perception.inputs.colmap_files import Model, names_in, read_model
 from perception.io.documents import safe_name
 from perception.photos.folder import folders_below, list_photos
+from perception.photos.lens import lens_from_camera
 from perception.photos.named_files import NamedFiles, parts_of
 from perception.photos.views import first_of, without_far
 from perception.sfm.model import cloud_of, views_of_model
 from perception.sfm.options import ReadOptions
 from perception.sfm.triangulate import MIN_POINTS, posed_scene
-from perception.types import Scene
+from perception.types import Lens, Scene
 
 DEPTH = 3
 """Folders below the input in which models are looked for, and photos one less: "colmap/sparse/0" and "dslr/images"."""
@@ -82,18 +83,15 @@ def read_workspace(folder: Path, options: ReadOptions) -> Scene:
     """The preferred sparse model of a workspace as a Scene, in COLMAP's world.
     Photos that are missing or damaged, or whose pose or camera is not finite, are left out and reported. Image names
     that point outside the photo folder raise InputError."""
-    paths, models = models_below(folder), [read_model(path) for path in _preferred(folder)]
-    model = max(models, key=lambda model: model.reconstruction.num_reg_images())
+    paths, (models, model) = models_below(folder), _models(folder)
     path, reconstruction = model.path, model.reconstruction
-    if reconstruction.num_reg_images() == 0:
-        raise InputError(f"{path}: the sparse model is empty (no registered photo); run structure from motion again")
     located, wrong = _located(folder, model)
     if wrong and (options.strict or not located):
         raise InputError(f"{path}: {len(wrong)} of {len(model.names)} photos cannot be used{first_of(wrong)}")
     views, facts = views_of_model(reconstruction, located, path, options, upright=False)
     facts["left_out"] = sorted([*facts["left_out"], *wrong], key=lambda entry: entry["name"])
     if len(paths) > 1:
-        sizes = {model.path: f" ({model.reconstruction.num_reg_images()} photos)" for model in models}
+        sizes = {model.path: f" ({_registered(model)} photos)" for model in models}
         others = ", ".join(f"{other.relative_to(folder)}{sizes.get(other, '')}" for other in paths if other != path)
         used = f"{path.relative_to(folder)}{sizes[path]}"
         facts["warnings"].append(f"{folder}: {len(paths)} sparse models; {used} is used, not {others}")
@@ -108,6 +106,33 @@ def read_workspace(folder: Path, options: ReadOptions) -> Scene:
     facts["notes"] = [f"poses of {folder}: COLMAP model {path.relative_to(folder)}"]
     facts |= {"model": path.relative_to(folder).as_posix(), "mean_reprojection_error_px": error}
     return posed_scene(views, cloud, {"input": "colmap", **facts}, options, MIN_POINTS)
+
+
+def model_frames(folder: Path) -> list[tuple[str, np.ndarray, Lens]]:
+    """(name, camera_from_world [4, 4], lens) of the images of the model that `read_workspace` reads, by name, but those
+    that are wrong; photos need not exist."""
+    _, model = _models(folder)
+    lenses = {number: lens_from_camera(camera) for number, camera in model.reconstruction.cameras.items()}
+    good = sorted((model.names[i], i) for i in model.reconstruction.reg_image_ids() if i not in model.wrong)
+    images = [(name, model.reconstruction.images[i]) for name, i in good]
+    return [
+        (name, np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]), lenses[image.camera_id])
+        for name, image in images
+    ]
+
+
+def _models(folder: Path) -> tuple[list[Model], Model]:
+    """The models of `_preferred`, and the largest. InputError where that is empty."""
+    models = [read_model(path) for path in _preferred(folder)]
+    model = max(models, key=_registered)
+    if _registered(model) == 0:
+        found = "the sparse model is empty (no registered photo)"
+        raise InputError(f"{model.path}: {found}; run structure from motion again")
+    return models, model
+
+
+def _registered(model: Model) -> int:
+    return int(model.reconstruction.num_reg_images())
 
 
 def _preferred(folder: Path) -> list[Path]:

@@ -15,8 +15,9 @@ from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.model import Gaussians
 from perception.gaussians.views import expected_depth, psnr, render
+from perception.inputs.colmap import model_frames, models_below
 from perception.inputs.readers import reader_of
-from perception.inputs.transforms import read_frames
+from perception.inputs.transforms import read_frames, transforms_files
 from perception.photos.decode import load_photo, scaled_K
 from perception.photos.views import make_view
 from perception.sfm.options import ReadOptions
@@ -118,17 +119,15 @@ def _told(facts: dict[str, Any]) -> str:
 
 
 def _given(cameras: Path, options: ReadOptions) -> tuple[list[View], list[str]]:
-    """The views of a posed input, and notes. A transforms.json whose photos are missing gives its poses alone."""
+    """The views of a posed input, and notes. One without any of its photos gives its poses alone."""
     reader = reader_of(cameras)
     if not reader.poses:
         raise InputError(f"{cameras}: is read as {reader.name}; expected a COLMAP workspace or a transforms.json")
-    try:
+    if reader.sizes(cameras).sizes:
         scene = reader.read(cameras, replace(options, poses="keep", still=False))
         return scene.views, [f"{len(scene.views)} photos with poses of {cameras}"]
-    except InputError:
-        if cameras.suffix.lower() != ".json":
-            raise
-    frames = read_frames(cameras)
+    frames = [frame for file in transforms_files(cameras) for frame in read_frames(file)]
+    frames = model_frames(cameras) if models_below(cameras) else frames
     views = [make_view(f"given/{n:04d}.png", Path(), lens, pose, cameras) for n, (_, pose, lens) in enumerate(frames)]
     return views, [f"{len(views)} poses without photos of {cameras}"]
 

@@ -60,6 +60,33 @@ def test_given_views_have_the_depth_of_the_walls(room: Splat, tmp_path: Path, ph
     assert bool(warnings) == photos  # grey photos are unlike the room
 
 
+@pytest.mark.parametrize("kind", ["json", "colmap"])
+def test_a_folder_without_its_photos_gives_its_poses(kind: str, tmp_path: Path) -> None:
+    if kind == "json":
+        cameras_file(tmp_path)
+    else:
+        sparse = tmp_path / "sparse" / "0"
+        sparse.mkdir(parents=True)
+        (sparse / "cameras.txt").write_text(f"1 SIMPLE_RADIAL {WIDTH} {HEIGHT} {FOCAL} {WIDTH / 2} {HEIGHT / 2} 0.01\n")
+        (sparse / "points3D.txt").write_text("")
+        (sparse / "images.txt").write_text("3 0.5 0.5 0.5 0.5 7 8 9 1 b.jpg\n\n1 1 0 0 0 1 2 3 1 a.jpg\n\n")
+    views, notes = _given(tmp_path, ReadOptions(tmp_path / "sfm"))
+    assert len(views) == (4 if kind == "json" else 2) and "poses without photos" in notes[0]
+    if kind == "colmap":
+        assert [view.lens.params[0] for view in views if view.lens] == [FOCAL, FOCAL]
+        cycle = np.array([[0.0, 0, 1, 7], [1, 0, 0, 8], [0, 1, 0, 9], [0, 0, 0, 1]])  # 120° about 1, 1, 1
+        expected = [np.block([[np.eye(3), np.array([[1], [2], [3]])], [np.zeros((1, 3)), 1]]), cycle]
+        np.testing.assert_allclose([view.camera_from_world for view in views], expected, atol=1e-12)
+
+
+def test_photos_that_do_not_fit_their_cameras_are_told(tmp_path: Path) -> None:
+    file = cameras_file(tmp_path, photos=True)
+    for number in range(4):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((HEIGHT, 2 * WIDTH, 3), 128, np.uint8))
+    with pytest.raises(InputError, match="is 128×48 but its camera says 64×48"):
+        _given(file, ReadOptions(tmp_path / "sfm"))
+
+
 def test_cameras_of_another_frame_are_refused(room: Splat, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="of another frame"):
         views_of(room, cameras_file(tmp_path, shift=40.0), tmp_path)
