@@ -56,7 +56,8 @@ class Recording:
 
 def recorded_scene(recording: Recording, options: ReadOptions) -> Scene:
     """The chosen frames of a recording as a Scene in its own world, whose unit is the metre.
-    Frames with a pose that is not rigid or far from all others are left out. InputError for a missing lens, and depth
+    Frames with a pose that is not rigid or far from all others, and with a photo that is damaged or does not fit the
+    lens, are left out. InputError for a missing lens, and depth
     whose unit cannot be right."""
     source, kind, lens = recording.source, recording.kind, options.lens or recording.lens
     if not recording.frames:
@@ -65,14 +66,23 @@ def recorded_scene(recording: Recording, options: ReadOptions) -> Scene:
         raise InputError(f"{source}: a recording as of {kind} without the intrinsics of its photos; give --camera FILE")
     recording, wrong = _with_poses(recording, options.strict)
     chosen, damaged = choose_frames(recording, lens, options.progress, options.strict)
-    views = [_view(recording, frame, lens, options.masks) for frame in chosen]
+    views, unfit = list[View](), list[dict[str, str]]()
+    for frame in chosen:
+        try:
+            views.append(_view(recording, frame, lens, options.masks))
+        except InputError as error:
+            if options.strict:
+                raise
+            unfit.append({"name": frame.name, "why": str(error)})
+    if not views:
+        raise InputError(f"{source}: none of the {len(chosen)} chosen photos can be used{first_of(unfit)}")
     cloud = options.cloud or NO_CLOUD
     views, far = without_far(views, cloud[0], set(), options.strict, source)
     unread = [{"name": name, "why": "the photo cannot be read"} for name in damaged]
     taken = f"{len(chosen)} of {len(recording.frames)} frames chosen, sharp and well spaced"
     facts: dict[str, Any] = {
         "input": kind,
-        "left_out": [*wrong, *unread, *far],
+        "left_out": [*wrong, *unread, *unfit, *far],
         "notes": [f"{source}: {kind}, {taken}", *recording.notes],
         "warnings": recording.warnings,
         "mean_reprojection_error_px": None,

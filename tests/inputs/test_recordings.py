@@ -167,6 +167,19 @@ def test_one_frame_with_a_wrong_pose_is_left_out(matrix: np.ndarray, tmp_path: P
         load_scene(source, ReadOptions(tmp_path / "strict", strict=True))
 
 
+def test_one_photo_of_another_shape_is_left_out(tmp_path: Path) -> None:
+    source = write_recording(tmp_path, "scannet")
+    names = {view.name for view in loaded(source, tmp_path).views}
+    odd = source / sorted(names)[2]
+    cv2.imwrite(str(odd), cv2.imread(str(odd))[:-30])  # the pattern is as sharp, so the same frames are chosen
+    scene = loaded(source, tmp_path)
+    assert {view.name for view in scene.views} == names - {sorted(names)[2]}
+    (entry,) = scene.report["left_out"]
+    assert entry["name"] == sorted(names)[2] and "but its camera says" in entry["why"]
+    with pytest.raises(InputError, match="but its camera says"):
+        load_scene(source, ReadOptions(tmp_path / "strict", strict=True))
+
+
 def _backslashes(source: Path) -> None:
     for name in ("rgb.txt", "depth.txt"):
         _edit(source / name, "/", "\\")
