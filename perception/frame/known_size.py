@@ -91,6 +91,10 @@ def scale_of_pixels(views: Sequence[View], length: KnownLength) -> Measurement:
     for name, pixels in pixels_of.items():
         if name not in number:
             raise InputError(f"known length: '{name}' is none of the {len(views)} photos, such as {views[0].name}")
+        size = views[number[name]].photo_size
+        if (pixels < 0).any() or (pixels > size).any():
+            found = " and ".join(f"{x:g},{y:g}" for x, y in pixels)
+            raise InputError(f"known length: '{name}' has {size[0]}×{size[1]} pixels, found {found}; give pixels in it")
         rays[number[name]] = rays_of_pixels(views[number[name]], pixels)
     if len(pixels_of) < 2:
         raise InputError("known length: both ends are needed in two photos or more, found one; add '; PHOTO X,Y X,Y'")

@@ -140,6 +140,8 @@ def test_a_length_between_pixels(tmp_path: Path) -> None:
         scale_of_pixels(views, known_length("1: zzz.png 1,2 3,4; 003.png 1,2 3,4"))
     with pytest.raises(InputError, match="both ends are needed in two photos"):
         scale_of_pixels(views, known_length("1: 003.png 1,2 3,4"))
+    with pytest.raises(InputError, match=r"'014\.png' has 640×480 pixels, found 300,200 and 300,480\.5; give pixels"):
+        scale_of_pixels(views, known_length("1: 003.png 0,0 640,480; 014.png 300,200 300,480.5"))
 
 
 def test_forms_of_a_known_length() -> None:
