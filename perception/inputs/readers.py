@@ -160,6 +160,7 @@ EXPECTED = (
     "a folder of photos, a video, a COLMAP workspace, a transforms.json, an RGB-D recording (TUM, ScanNet, 7-Scenes, "
     "3DMatch, Redwood) or a finished splat (.ply, .spz)"
 )
+_BAGS = (".bag", ".mcap", ".db3")
 UNREAD = (
     *("*.nvm", "bundle*.out", "cameras.xml", "cameras.sfm", "sfm_data.json", "poses_bounds.npy", "reconstruction.json"),
     *("cameras.json", "model.tsv", "*.rsproj", "*.psx"),
@@ -169,10 +170,13 @@ OpenSfM, Gaussian splatting, RealityScan."""
 
 
 def reader_of(source: Path) -> Reader:
-    """The first reader that recognises `source`. InputError where none does."""
+    """The first reader that recognises `source`. InputError where none does, and for a ROS bag."""
     if not source.exists():
         raise InputError(f"{source}: no such file or folder; expected {EXPECTED}")
     found = next((reader for reader in READERS if reader.recognises(source)), None)
+    inside = source.glob("*") if source.is_dir() else [source]
+    if any(path.suffix in _BAGS for path in inside) and (found is None or not found.files(source)):
+        raise InputError(f"{source}: is a ROS bag; take photos and poses out of it first: perception frames")
     if found is None:
         raise InputError(f"{source}: expected {EXPECTED}")
     return found

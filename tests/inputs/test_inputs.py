@@ -147,8 +147,15 @@ def test_folders_that_are_no_scene(tmp_path):
     (tmp_path / "photos").mkdir()
     with pytest.raises(InputError, match="no photos"):
         load_scene(tmp_path / "photos", ReadOptions(tmp_path / "work"))
+    for bag in ("drive.bag", "drive/drive_0.mcap", "old/old_0.db3"):
+        (tmp_path / bag).parent.mkdir(exist_ok=True)
+        (tmp_path / bag).write_bytes(b"")
+        for source in {tmp_path / bag, (tmp_path / bag).parent} - {tmp_path}:
+            with pytest.raises(InputError, match=r"is a ROS bag; .* perception frames"):
+                load_scene(source, ReadOptions(tmp_path / "work"))
     picture(tmp_path / "photos" / "a.png")
     picture(tmp_path / "photos" / "b.png", seed=1)
+    (tmp_path / "photos" / "a.bag").write_bytes(b"")  # beside photos
     with pytest.raises(InputError, match="at least 3"):
         load_scene(tmp_path / "photos", ReadOptions(tmp_path / "work"))
     picture(tmp_path / "photos" / "c.png", seed=2)
