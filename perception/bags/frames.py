@@ -14,7 +14,7 @@ import numpy as np
 
 from perception.bags.cameras import image_camera
 from perception.bags.depth import MILLIMETRES, choose_depth, depth_topics, write_depth
-from perception.bags.poses import FIXED_FRAMES, Poses, gravity, read_poses
+from perception.bags.poses import FIXED_FRAMES, MAX_GAP, Poses, gravity, read_poses
 from perception.bags.read import IMAGES, Bag, decode_image, encoded, frame_of, open_bag, stamp_of
 from perception.errors import InputError, shell_word
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
@@ -90,10 +90,9 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
                 shutil.rmtree(aside / "depth", ignore_errors=True)
                 source_of_depth = f"left out: {error}"
             known, fixed = _camera_poses(poses, stamps, frame, options.fixed_frame)
-            if fixed is None and options.fixed_frame is not None:
-                found = f"no image has a pose of '{frame}' in --fixed-frame '{options.fixed_frame}'"
-                above = ", ".join(poses.path(frame)[1:]) or "none"
-                raise InputError(f"{bag.path}: {found}; frames above '{frame}': {above}")
+            why = None if fixed is not None else _why_no_pose(poses, frame, options.fixed_frame)
+            if why is not None and options.fixed_frame is not None:
+                raise InputError(f"{bag.path}: --fixed-frame {options.fixed_frame}: {why}")
             down = None if fixed is None else gravity(bag, poses, fixed, frame)
             vertical: dict[str, Any] = {"gravity": None, "gravity_std_deg": None}
             if down is not None:
@@ -108,6 +107,7 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
         "chosen": len(stamps),
         "with_pose": len(known),
         "fixed_frame": fixed,
+        "why_no_pose": why,
         "camera_frame": frame,
         "size": [lens.width, lens.height],
         "camera_model": lens.model,
@@ -163,6 +163,17 @@ def _camera_poses(
     return best, world
 
 
+def _why_no_pose(poses: Poses, frame: str, fixed: str | None) -> str:
+    """Why no image of the camera frame has a pose; fixed: the world that was asked for."""
+    above = poses.path(frame)[1:]
+    if not above:
+        return f"no transform or odometry leads to '{frame}', the frame of the images"
+    if fixed is not None and fixed.lstrip("/") not in above:
+        return f"frames above '{frame}' are {', '.join(above)}"
+    found = f"no image lies between samples of {', '.join(above)} at most {MAX_GAP} s apart"
+    return f"{found}; do images and transforms use one clock?"
+
+
 def _transforms(
     known: dict[str, np.ndarray], stamps: dict[str, int], lens: Lens, depth: dict[str, str]
 ) -> dict[str, Any]:
@@ -194,4 +205,4 @@ def _text(facts: dict[str, Any]) -> str:
     if facts["with_pose"]:
         return f"{line}\nnext: perception map {shell_word(folder)} -o MAP"
     images, camera = (shell_word(f"{folder}/{name}") for name in ("images", "camera.yaml"))
-    return f"{line}\nno poses\nnext: perception map {images} --camera {camera} -o MAP"
+    return f"{line}\nno poses: {facts['why_no_pose']}\nnext: perception map {images} --camera {camera} -o MAP"

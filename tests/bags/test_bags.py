@@ -112,9 +112,21 @@ def test_a_fixed_frame_without_poses_is_refused_and_others_are_named(tmp_path: P
         bag.jpeg("/compressed", time, cv2.imencode(".jpg", photo(i))[1].tobytes())
         bag.transform("/tf", time, "odom", "cam", pose(0.1 * i, 0.2 * i))
     bag.close()
-    with pytest.raises(InputError, match=r"'cam' in --fixed-frame 'odomm'; frames above 'cam': odom$"):
+    with pytest.raises(InputError, match=r"--fixed-frame odomm: frames above 'cam' are odom$"):
         run_frames(tmp_path / "drive", tmp_path / "out", FrameOptions(fixed_frame="odomm"))
     assert not (tmp_path / "out").exists()
+
+
+def test_why_there_are_no_poses(tmp_path: Path) -> None:
+    """Images stamped by a clock that counts from the start of the camera."""
+    bag = Recorder(tmp_path / "drive", "mcap")
+    bag.info("/camera_info", TIMES[0], (128, 96), K, D)
+    for i, time in enumerate(TIMES[:3]):
+        bag.jpeg("/compressed", time, cv2.imencode(".jpg", photo(i))[1].tobytes())
+        bag.transform("/tf", time + 10**18, "odom", "cam", pose(0.1 * i, 0.2 * i))
+    bag.close()
+    facts, text = run_frames(tmp_path / "drive", tmp_path / "out")
+    assert facts["with_pose"] == 0 and "no poses: no image lies between samples of odom" in text and "one clock" in text
 
 
 @pytest.mark.parametrize("tf", [True, False])
@@ -148,7 +160,12 @@ def test_rectified_images_take_the_camera_of_rectified_images(tmp_path: Path, to
         bag.jpeg(topic, time, cv2.imencode(".jpg", photo(i))[1].tobytes())
     bag.close()
     plain, text = run_frames(tmp_path / "drive", tmp_path / "out")
-    assert plain["with_pose"] == 0 and "--camera" in text and not (tmp_path / "out" / "transforms.json").exists()
+    assert (
+        plain["with_pose"] == 0
+        and "leads to 'cam'" in text
+        and "--camera" in text
+        and not (tmp_path / "out" / "transforms.json").exists()
+    )
     params = np.array(read_camera(tmp_path / "out" / "camera.yaml").params)
     if "rect" in topic:  # the recorder writes P = .9 K
         np.testing.assert_allclose(
