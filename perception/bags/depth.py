@@ -135,6 +135,9 @@ def write_depth(
     written = dict[str, str]()
     for one, depth in bag.decoded(topic, decode_depth, {nearest[name] for name in near}):
         there, size = frame_of(one.message), depth.shape[::-1]
+        if own is not None and not same_aspect(size, (own.width, own.height)):
+            found = f"an image is {size[0]}x{size[1]} pixels, its camera_info says {own.width}x{own.height}"
+            raise InputError(f"{bag.path}: {topic}: {found}; record depth with the camera_info of its own size")
         if there != frame or not (same_aspect(size, (lens.width, lens.height)) if own is None else _same(own, lens)):
             moved = poses.between(frame, there, times[one.number]) if frame and there else None
             if own is None or moved is None:

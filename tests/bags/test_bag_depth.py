@@ -158,3 +158,18 @@ def test_depth_that_cannot_be_used(options: FrameOptions, late: int, words: str 
     facts, text = run_frames(tmp_path / "drive", tmp_path / "out", options)
     assert facts["with_depth"] == 0 and not (tmp_path / "out" / "depth").exists()
     assert ("depth: left out" in text) == (options.depth is None)
+
+
+def test_depth_of_another_shape_than_its_camera_is_left_out(tmp_path: Path) -> None:
+    bag = Recorder(tmp_path / "drive", "mcap")
+    for camera in ("color", "depth"):
+        bag.info(f"/{camera}/camera_info", START, SIZE, COLOR, [0.0] * 5)
+    for index in range(3):
+        bag.image("/color/image_raw", START + index * STEP_NS, picture(wall_depth(COLOR, pose(index), *SIZE)[1]))
+        cropped = np.full((SIZE[1] - 20, SIZE[0]), 2.0, np.float32)
+        bag.image("/depth/image_raw", START + index * STEP_NS, cropped, "cam", "32FC1")
+    bag.close()
+    facts, text = run_frames(tmp_path / "drive", tmp_path / "out")
+    assert facts["with_depth"] == 0 and f"its camera_info says {SIZE[0]}x{SIZE[1]}" in text
+    with pytest.raises(InputError, match="an image is"):
+        run_frames(tmp_path / "drive", tmp_path / "named", FrameOptions(depth="/depth/image_raw"))
