@@ -145,10 +145,10 @@ def _scannet(source: Path) -> Recording:
     """Exported frames: color/, depth/ in mm, pose/ world_from_camera, infinite where tracking was lost."""
     photos = _images(source / "color")
     frames = _posed(source, photos, lambda photo, kind: source / kind / photo.stem)
-    depth = next((frame.depth for frame in frames if frame.depth is not None), None)
-    own = None if depth is None else _matrix_lens(source / "intrinsic/intrinsic_depth.txt", photo_size(depth))
+    depths = [frame.depth for frame in frames if frame.depth is not None]
+    own = _matrix_lens(source / "intrinsic/intrinsic_depth.txt", _first_size(depths)) if depths else None
     notes = _missing(len(photos) - len(frames), len(photos), "a pose (tracking was lost)")
-    lens = _matrix_lens(source / "intrinsic/intrinsic_color.txt", photo_size(photos[0]))
+    lens = _tried(_matrix_lens, source / "intrinsic/intrinsic_color.txt", _first_size(photos))
     return Recording(source, "ScanNet", frames, lens, 1000.0, own, notes)
 
 
@@ -158,7 +158,7 @@ def _seven_scenes(source: Path) -> Recording:
     frames = _posed(source, photos, lambda photo, kind: photo.with_name(f"{photo.name.partition('.')[0]}.{kind}"))
     notes = _missing(len(photos) - len(frames), len(photos), "a pose")
     for folder in (source, source.parent):
-        lens = _matrix_lens(folder / "camera-intrinsics.txt", photo_size(photos[0]))
+        lens = _tried(_matrix_lens, folder / "camera-intrinsics.txt", _first_size(photos))
         if lens is not None:
             folders = {photo.parent for photo in photos}
             if len(folders) > 1:
@@ -200,10 +200,11 @@ def _redwood(source: Path) -> Recording:
         raise InputError(f"{source}: several trajectories ({', '.join(log.name for log in logs)}); keep one of them")
     poses = _trajectory(named[0], len(photos))
     frames = [Frame(f"{folder.name}/{photos[i].name}", photos[i], depths[i], pose) for i, pose in poses.items()]
-    lens, notes = None, _missing(len(photos) - len(poses), len(photos), "a pose")
+    lens: Lens | InputError | None = None
+    notes = _missing(len(photos) - len(poses), len(photos), "a pose")
     if cameras := sorted(source.glob("*intrinsic*.json")) + sorted(source.glob("camera*.json")):
-        lens = _open3d_lens(cameras[0])
-    elif photo_size(photos[0]) == _SIZE:
+        lens = _tried(_open3d_lens, cameras[0])
+    elif _first_size(photos) == _SIZE:
         lens = _lens(_PRIMESENSE, _SIZE)
         notes.append(f"{source}: no intrinsics, those of PrimeSense are used ({_PRIMESENSE[0]:g} pixels)")
     return Recording(source, "Redwood / Open3D", frames, lens, 1000.0, None, notes)
@@ -252,6 +253,22 @@ def _rows(file: Path) -> list[list[str]]:
     if not rows:
         raise InputError(f"{file}: is empty")
     return rows
+
+
+def _first_size(images: list[Path]) -> tuple[int, int]:
+    """Of the first image that can be read. InputError where none can."""
+    for image in images:
+        with contextlib.suppress(InputError):
+            return photo_size(image)
+    return photo_size(images[0])
+
+
+def _tried(read: Callable[..., Lens | None], *of: object) -> Lens | InputError | None:
+    """The lens that `read` returns, or its error: `--camera` takes the place of intrinsics that are wrong."""
+    try:
+        return read(*of)
+    except InputError as error:
+        return error
 
 
 def _matrix_lens(file: Path, size: tuple[int, int]) -> Lens | None:

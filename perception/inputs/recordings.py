@@ -40,14 +40,15 @@ class Frame:
 
 @dataclass(frozen=True)
 class Recording:
-    """kind: for messages. frames: in order of time. lens: of all photos, None when the folder has no intrinsics.
+    """kind: for messages. frames: in order of time. lens: of all photos, None when the folder has no intrinsics, an
+    error when they cannot be used.
     metre: stored units of depth per metre. depth_lens: of the depth camera, at the photo's pose; None when depth shows
     what the photo shows. notes, warnings: one line each."""
 
     source: Path
     kind: str
     frames: list[Frame]
-    lens: Lens | None
+    lens: Lens | InputError | None
     metre: float = 1000.0
     depth_lens: Lens | None = None
     notes: list[str] = field(default_factory=list)
@@ -62,6 +63,8 @@ def recorded_scene(recording: Recording, options: ReadOptions) -> Scene:
     source, kind, lens = recording.source, recording.kind, options.lens or recording.lens
     if not recording.frames:
         raise InputError(f"{source}: a recording as of {kind}, but no frame has both photo and pose")
+    if isinstance(lens, InputError):
+        raise lens
     if lens is None:
         raise InputError(f"{source}: a recording as of {kind} without the intrinsics of its photos; give --camera FILE")
     recording, wrong = _with_poses(recording, options.strict)

@@ -180,6 +180,29 @@ def test_one_photo_of_another_shape_is_left_out(tmp_path: Path) -> None:
         load_scene(source, ReadOptions(tmp_path / "strict", strict=True))
 
 
+@pytest.mark.parametrize("layout", ["scannet", "3dmatch", "redwood"])
+def test_a_camera_file_takes_the_place_of_wrong_intrinsics(layout: str, tmp_path: Path) -> None:
+    source = write_recording(tmp_path, layout)
+    matrices = [*source.rglob("intrinsic_color.txt"), *source.parent.rglob("camera-intrinsics.txt")]
+    for file in matrices:
+        np.savetxt(file, np.eye(4) * 900)
+    if not matrices:
+        (source / "camera_intrinsic.json").write_text("{}")
+    with pytest.raises(InputError, match=r"were they resized|Open3D's camera intrinsics"):
+        loaded(source, tmp_path)
+    (tmp_path / "camera.yaml").write_text(CAMERA)
+    assert {view.K[0, 0] for view in loaded(source, tmp_path, tmp_path / "camera.yaml").views} == {100.0}
+
+
+@pytest.mark.parametrize("layout", ["scannet", "3dmatch", "7scenes", "redwood", "tum"])
+def test_a_first_photo_that_is_empty_is_left_out(layout: str, tmp_path: Path) -> None:
+    source = write_recording(tmp_path, layout)
+    first = open_recording(source).frames[0]
+    first.photo.write_bytes(b"")
+    scene = loaded(source, tmp_path)
+    assert first.name in {entry["name"] for entry in scene.report["left_out"]} and len(scene.views) >= 6
+
+
 def _backslashes(source: Path) -> None:
     for name in ("rgb.txt", "depth.txt"):
         _edit(source / name, "/", "\\")
