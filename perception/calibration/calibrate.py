@@ -18,7 +18,7 @@ from perception.errors import InputError
 from perception.io.atomic import write_file
 from perception.map.outputs import check_side_file, refuse_inputs
 from perception.photos.camera_file import camera_data, write_camera
-from perception.photos.decode import read_grey
+from perception.photos.decode import orientation, read_grey
 from perception.photos.folder import list_photos
 from perception.photos.video import frames
 
@@ -90,6 +90,9 @@ def _pictures(source: Path) -> Iterator[tuple[str, np.ndarray]]:
         if not files:
             raise InputError(f"{source}: holds no photos; expected pictures of a calibration board")
         for file in files:
+            if orientation(file) != orientation(files[0]):
+                what = f"{file.name} was taken with the camera turned against {files[0].name} (EXIF)"
+                raise InputError(f"{source}: {what}, so its lens lies elsewhere; give photos of one orientation")
             yield file.name, read_grey(file)
     elif source.is_file():
         number = None

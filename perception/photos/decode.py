@@ -51,8 +51,14 @@ def photo_size(path: Path, as_stored: bool = False) -> tuple[int, int]:
 
 def is_turned(path: Path) -> bool:
     """Whether EXIF says that the photo is to be rotated or mirrored."""
+    return orientation(path) != 1
+
+
+def orientation(path: Path) -> int:
+    """EXIF's orientation of the photo, 1 to 8; 1 where it is missing or another number."""
     with open_photo(path) as image:
-        return exif_of(image, path).get(ORIENTATION) in _BACK
+        found = exif_of(image, path).get(ORIENTATION)
+        return found if found in _BACK else 1
 
 
 def reduced_size(width: int, height: int, factor: int) -> tuple[int, int]:

@@ -233,3 +233,16 @@ def test_what_macs_leave_beside_photos_is_no_photo(tmp_path) -> None:
     (tmp_path / "b.jpg").mkdir()
     with pytest.raises(InputError, match="found in 1 pictures"):
         run_calibration(tmp_path, tmp_path / "camera.yaml", Board("checkerboard", (7, 5), 0.03))
+
+
+@pytest.mark.parametrize("turned", [1, 2])
+def test_a_camera_that_was_turned_between_the_photos(turned: int, tmp_path) -> None:
+    """Of a phone held over a table, EXIF tells either way up; turned by 180°, the principal point is mirrored."""
+    (tmp_path / "photos").mkdir()
+    for number, value in enumerate((3, 3) if turned == 2 else (1, 3)):
+        exif = Image.Exif()
+        exif[0x0112] = value
+        Image.new("RGB", (64, 48), "grey").save(tmp_path / "photos" / f"{number}.jpg", exif=exif)
+    words = "no charuco" if turned == 2 else r"1\.jpg was taken with the camera turned against 0\.jpg"
+    with pytest.raises(InputError, match=words):
+        run_calibration(tmp_path / "photos", tmp_path / "camera.yaml", CHARUCO)
