@@ -21,7 +21,7 @@ from perception.inputs.transforms import (
     transforms_files,
 )
 from perception.photos import video
-from perception.photos.decode import photo_size
+from perception.photos.decode import orientation, photo_size
 from perception.photos.folder import VIDEO_SUFFIXES, list_photos
 from perception.photos.views import fit_lens
 from perception.sfm.options import ReadOptions
@@ -110,14 +110,23 @@ def _read_photos(source: Path, options: ReadOptions) -> Scene:
 
 
 def _reconstructed(folder: Path, options: ReadOptions) -> Scene:
-    """`reconstruct`, with the lens of a camera file scaled to the photos where they were resized."""
-    if (lens := options.lens) is None:
+    """`reconstruct`, with the lens of a camera file scaled to the largest photos that it fits: smaller copies are left
+    out. A warning where the camera was turned by 180° between photos, which mirrors its principal point."""
+    if options.lens is None:
         return reconstruct(folder, options)
+    fitting = []
     for photo in list_photos(folder):
         with contextlib.suppress(InputError):
-            lens = fit_lens(lens, photo, as_stored=False) or lens
-            break
-    return reconstruct(folder, replace(options, lens=lens))
+            fitting.append(fit_lens(options.lens, photo, as_stored=False))
+    lens = max(filter(None, fitting), key=lambda lens: lens.width * lens.height, default=options.lens)
+    scene = reconstruct(folder, replace(options, lens=lens))
+    turns = [orientation(view.photo) for view in scene.views]
+    other = [view.name for view, turn in zip(scene.views, turns, strict=True) if turn != max(turns, key=turns.count)]
+    if other:
+        turned = f"{len(other)} of {len(turns)} photos, such as {other[0]}, were taken with the camera turned by 180°"
+        why = "which mirrors its principal point; map them without --camera"
+        scene.report["warnings"].append(f"{options.camera}: {turned} (EXIF), {why}")
+    return scene
 
 
 def _refuse_splat(source: Path, options: ReadOptions) -> Scene:

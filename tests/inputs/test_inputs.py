@@ -10,6 +10,7 @@ from PIL import Image
 
 from perception.errors import InputError
 from perception.geometry import align_similarity, inverse_se3
+from perception.inputs import readers
 from perception.inputs.load import load_scene, photo_sizes
 from perception.inputs.transforms import read_frames
 from perception.io import atomic
@@ -21,7 +22,7 @@ from perception.photos.views import make_view
 from perception.progress import Progress
 from perception.sfm import pairs, triangulate
 from perception.sfm.options import ReadOptions
-from perception.types import Lens, View
+from perception.types import Lens, Scene, View
 from support.aimed import look_at
 from support.rotations import rotation_from_quaternion
 
@@ -172,6 +173,29 @@ def test_folders_that_are_no_scene(tmp_path):
     (tmp_path / "photos" / "c.png").write_bytes(data[: len(data) // 2])
     with pytest.raises(InputError, match=r"c.png.*(truncated|damaged)"):
         load_scene(tmp_path / "photos", ReadOptions(tmp_path / "work"))
+
+
+def test_a_camera_file_is_scaled_to_the_largest_photos_and_turned_ones_are_told(tmp_path, monkeypatch):
+    sizes = {"a_pano.jpg": (200, 40), "b_small/1.jpg": (25, 20), "c/1.jpg": (50, 40), "c/2.jpg": (50, 40)}
+    for number, (name, size) in enumerate(sizes.items()):
+        exif = Image.Exif()
+        exif[0x0112] = 3 if name == "c/2.jpg" else 1
+        picture(tmp_path / "photos" / name, size=size, seed=number, exif=exif)
+    (tmp_path / "camera.yaml").write_text(CAMERA)
+    used = []
+
+    def scene_of(folder, options):
+        used.append(options.lens)
+        views = [pinhole_view(folder / name, size) for name, size in sizes.items() if name[0] == "c"]
+        views.append(pinhole_view(folder / "c/1.jpg"))
+        return Scene(views, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), report={"warnings": [], "seconds": {}})
+
+    monkeypatch.setattr(readers, "reconstruct", scene_of)
+    scene = load_scene(tmp_path / "photos", ReadOptions(tmp_path / "work", camera=tmp_path / "camera.yaml"))
+    # The camera of 100 × 80 at half its size; the file counts pixels from the centre of the first one.
+    assert used[0].params[:4] == pytest.approx((45, 45.5, (48.5 + 0.5) / 2, (40.5 + 0.5) / 2))
+    (told,) = scene.report["warnings"]
+    assert "1 of 3 photos, such as 2.jpg, were taken with the camera turned" in told
 
 
 CAMERA = """
