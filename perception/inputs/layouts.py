@@ -98,12 +98,12 @@ def _tum(source: Path) -> Recording:
         raise InputError(f"{truth}: missing, so depth has no poses; expected lines 'time tx ty tz qx qy qz qw'")
     (at, photos), (depth_at, depths) = (_listed(source / name) for name in ("rgb.txt", "depth.txt"))
     rows = _numbers(truth, 8)
-    rows = rows[np.isfinite(rows[:, :8]).all(axis=1)]  # where tracking was lost
+    lost = ~np.isfinite(rows[:, :8]).all(axis=1) | (np.linalg.norm(rows[:, 4:8], axis=1) < 1e-6)  # of tracking
+    rows = rows[~lost]
     if len(rows) == 0:
-        raise InputError(f"{truth}: holds no pose of finite numbers; expected lines 'time tx ty tz qx qy qz qw'")
+        found = "holds no pose of finite numbers whose quaternion is not zero"
+        raise InputError(f"{truth}: {found}; expected lines 'time tx ty tz qx qy qz qw'")
     times, shifts, quaternions = np.split(rows[np.argsort(rows[:, 0], kind="stable"), :8], [1, 4], axis=1)
-    if (np.linalg.norm(quaternions, axis=1) < 1e-6).any():
-        raise InputError(f"{truth}: a quaternion is zero; expected lines 'time tx ty tz qx qy qz qw'")
     times, poses = times[:, 0], np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = Rotation.from_quat(quaternions).as_matrix(), shifts
     after = np.searchsorted(depth_at, at).clip(min(1, len(depth_at) - 1), len(depth_at) - 1)
