@@ -81,13 +81,13 @@ def _read_video(source: Path, options: ReadOptions) -> Scene:
     folder = options.frames or options.workdir / "frames"
     new = not folder.exists()
     record = video.video_frames(source, folder, options.progress)
+    taken = f"{record['chosen']} of {record['frames']} frames of {source.name}"
     try:
         scene = _reconstructed(folder, options)
-    except InputError:
+    except InputError as error:
         if new:
             shutil.rmtree(folder, ignore_errors=True)
-        raise
-    taken = f"{record['chosen']} of {record['frames']} frames of {source.name}"
+        raise InputError(f"{source}: {taken} are sharp and of different views; {error}") from error
     scene.report["notes"].insert(0, f"{folder}: {taken}; they are the map's photos, keep them")
     return scene
 

@@ -79,6 +79,12 @@ def test_a_video_that_cannot_be_posed_leaves_no_frames(tmp_path: Path) -> None:
     assert not (tmp_path / "v.frames").exists()
 
 
+def test_a_video_of_a_camera_that_stands_still_is_told_by_its_name(tmp_path: Path) -> None:
+    video = write_video(tmp_path / "v.mp4", [pan(1)[0]] * 20)
+    with pytest.raises(InputError, match=r"v\.mp4: 1 of (19|20) frames of v\.mp4 are sharp .* 1 photo"):
+        load_scene(video, ReadOptions(tmp_path / "work", frames=tmp_path / "v.frames"))
+
+
 def test_frames_of_maps_with_points_in_their_names_lie_apart() -> None:
     assert [frames_folder(Path(f"floor.{n}")).name for n in (1, 2)] == ["floor.1.frames", "floor.2.frames"]
 
