@@ -89,7 +89,7 @@ def read_poses(bag: Bag) -> Poses:
     def add(one: Recorded, entry: Any, child: str, position: Any, quaternion: Any, static: bool = False) -> None:
         matrix = _matrix(position, quaternion)
         if matrix is None:
-            bag.leave_out(one.topic, one.number, f"the pose of '{child}' is not finite")
+            bag.leave_out(one.topic, one.number, f"the pose of '{child}' is not finite, or no rotation")
         elif topics.setdefault(child.lstrip("/"), one.topic) == one.topic:
             poses.add(entry.header.frame_id, child, stamp_of(entry), matrix, static)
 
@@ -104,11 +104,11 @@ def read_poses(bag: Bag) -> Poses:
 
 
 def _matrix(position: Any, quaternion: Any) -> np.ndarray | None:
-    """[4, 4]; None for numbers that are not finite."""
+    """[4, 4]; None for numbers that are not finite, and a quaternion of zeros, which is no rotation."""
     xyzw, xyz = [quaternion.x, quaternion.y, quaternion.z, quaternion.w], [position.x, position.y, position.z]
-    if not np.isfinite([*xyzw, *xyz]).all():
+    if not np.isfinite([*xyzw, *xyz]).all() or not any(xyzw):
         return None
-    return transform(Rotation.from_quat(xyzw if any(xyzw) else [0, 0, 0, 1]).as_matrix(), xyz)
+    return transform(Rotation.from_quat(xyzw).as_matrix(), xyz)
 
 
 @dataclass(frozen=True)

@@ -176,6 +176,26 @@ def test_rectified_images_take_the_camera_of_rectified_images(tmp_path: Path, to
         np.testing.assert_allclose(params[4:8], D[:4])
 
 
+def test_a_quaternion_of_zeros_is_left_out_and_told(tmp_path: Path) -> None:
+    """As tf2 ignores it; messages that nobody filled in hold zeros."""
+    bag = Recorder(tmp_path / "drive", "mcap")
+    bag.info("/camera_info", TIMES[0], (128, 96), K, D)
+    kinds = ("Vector3", "Quaternion", "Transform", "TransformStamped")
+    vector, quaternion, change, stamped = (bag.type(f"geometry_msgs/msg/{kind}") for kind in kinds)
+    unset = change(vector(5.0, 0.0, 0.0), quaternion(0.0, 0.0, 0.0, 0.0))
+    for i, time in enumerate(TIMES[:4]):
+        bag.jpeg("/compressed", time, cv2.imencode(".jpg", photo(i))[1].tobytes())
+        bag.transform("/tf", time, "odom", "cam", pose(0.1 * i, 0.2 * i))
+        empty = stamped(bag.header(time - 10_000_000, "odom"), "cam", unset)
+        bag.write("/tf", "tf2_msgs/msg/TFMessage", time, bag.type("tf2_msgs/msg/TFMessage")([empty]))
+    bag.close()
+    facts, text = run_frames(tmp_path / "drive", tmp_path / "out", FrameOptions(spacing=1e-3))
+    assert facts["with_pose"] == 4 and "/tf: 4 messages left out" in text and "no rotation" in text
+    for name, camera_from_world, _ in read_frames(tmp_path / "out" / "transforms.json"):
+        number = int(Path(name).stem)
+        np.testing.assert_allclose(inverse_se3(camera_from_world), pose(0.1 * number, 0.2 * number), atol=1e-9)
+
+
 def test_interpolation_and_gaps() -> None:
     poses = Poses()
     poses.add("world", "base", 0, pose(0.0, 0.0))
