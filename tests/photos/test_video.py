@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from perception.errors import InputError
-from perception.inputs.load import load_scene
+from perception.inputs.load import load_scene, photo_sizes
 from perception.photos.folder import list_photos
 from perception.photos.video import FRAMES_RECORD, frame_size, video_frames
 from perception.pipeline.checkpoint import frames_folder, working
@@ -55,6 +55,17 @@ def test_a_video_held_upright_gives_upright_frames(tmp_path: Path) -> None:
     for photo in list_photos(tmp_path / "frames"):
         expected = np.rot90(frames[int(photo.stem)], -1).astype(float)
         assert np.abs(np.asarray(Image.open(photo)) - expected).mean() < 12  # two lossy codecs
+
+
+@pytest.mark.parametrize("name", ["v.3gp", "v.mpg", "V.MTS", "v.wmv"])
+def test_videos_of_phones_and_camcorders(name: str, tmp_path: Path) -> None:
+    """The wrapper is by the name of the file that OpenCV writes."""
+    rate, frames = 25, pan(3)
+    writer = cv2.VideoWriter(str(tmp_path / name), cv2.VideoWriter_fourcc(*"mp4v"), rate, (160, 120))  # type: ignore[attr-defined]
+    for frame in frames:
+        writer.write(frame)
+    writer.release()
+    assert photo_sizes(tmp_path / name).sizes[0] == (160, 120)
 
 
 def test_files_that_are_no_video(tmp_path: Path) -> None:
