@@ -18,8 +18,9 @@ from perception.photos.lens import resized
 from perception.photos.video import FRAMES_RECORD, THUMBNAIL, motion_between
 from perception.progress import Progress
 
-_OLDER = {".3gp", ".mpg", ".mpeg", ".mts", ".m2ts", ".wmv"}
-VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"} | _OLDER)
+VIDEO_SUFFIXES = frozenset(
+    [".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mpg", ".mpeg", ".mts", ".m2ts", ".wmv"]
+)
 SAME_MOTION, SAME_GREY = 0.006, 6.0
 """Neighbouring photos are duplicates when their corners move by less than this share of the width and their 320 pixel
 thumbnails differ by less than this mean grey level. Measured between neighbours on a walk: at least 0.011 and 11."""

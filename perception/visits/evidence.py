@@ -202,18 +202,25 @@ def in_free_space(looks: Sequence[Look], means: np.ndarray) -> np.ndarray:
     return counts >= LOOKED
 
 
+def sight(gaussians: Gaussians, view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of points [P, 3] the rows [M] of those in the picture, their depths [M], and that of the Gaussians there [M], at
+    a rough size, 0 = none."""
+    width, height = scaled_size(view, ROUGH)
+    matrices = view.camera_from_world, scaled_K(view, width, height)
+    camera, K = (torch.from_numpy(matrix.astype(np.float32)) for matrix in matrices)
+    picture = TrainingView(view.name, torch.zeros(height, width, 3, dtype=torch.uint8), None, K, camera)
+    inside, (row, column), z = picture.seen(points)
+    if not len(inside):
+        return inside, z[inside], np.zeros(0, np.float32)
+    return inside, z[inside], depth_image(gaussians, camera, K, width, height).numpy()[row, column]
+
+
 def looked_at(gaussians: Gaussians, views: Sequence[View], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two [P] bool: points [P, 3] that LOOKED views looked at, nothing of the Gaussians being in front of them; those
     that so many saw through, to a surface behind."""
     looked, through = np.zeros(len(points), int), np.zeros(len(points), int)
     for view in views:
-        width, height = scaled_size(view, ROUGH)
-        matrices = view.camera_from_world, scaled_K(view, width, height)
-        camera, K = (torch.from_numpy(matrix.astype(np.float32)) for matrix in matrices)
-        seen = TrainingView(view.name, torch.zeros(height, width, 3, dtype=torch.uint8), None, K, camera)
-        inside, (row, column), z = seen.seen(points)
-        if len(inside):
-            mapped = depth_image(gaussians, camera, K, width, height).numpy()[row, column]
-            looked[inside] += (mapped == 0) | (z[inside] <= (1 + AGREE) * mapped)
-            through[inside] += mapped > (1 + 2 * AGREE) * z[inside]
+        inside, z, mapped = sight(gaussians, view, points)
+        looked[inside] += (mapped == 0) | (z <= (1 + AGREE) * mapped)
+        through[inside] += mapped > (1 + 2 * AGREE) * z
     return looked >= LOOKED, through >= LOOKED

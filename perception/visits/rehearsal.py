@@ -14,23 +14,41 @@ from perception.gaussians.model import Gaussians
 from perception.gaussians.views import TrainingView, render
 from perception.photos.decode import scaled_K, scaled_size
 from perception.types import View
+from perception.visits.evidence import AGREE, sight
 
 SHOWN, HIDDEN = 0.9, 0.05
 """Opacity from which the map shows a pixel, and share of something else in it from which it does not count."""
+
+OVERLAP, SAMPLES = 0.1, 5000
+"""Least share of what the visit sees in a view, relative to the view that shows most; points by which it is told."""
+MOST = 64
+"""Renders that are trained: they are held in memory."""
+
+
+def showing(views: Sequence[View], gaussians: Gaussians, seen: np.ndarray) -> list[View]:
+    """The views that trained the map and show what a visit sees, `seen` [N] bool of the Gaussians: in a building most
+    show other rooms."""
+    points = gaussians.means.double().numpy()[seen]
+    points = points[:: 1 + len(points) // SAMPLES]
+    trained, counts = [view for view in views if not getattr(view, "held_out", False)], list[int]()
+    for view in trained:
+        _, z, mapped = sight(gaussians, view, points)
+        counts.append(int((np.abs(z - mapped) < 2 * AGREE * mapped).sum()))
+    least = max(1.0, OVERLAP * max(counts, default=0))
+    return [view for view, number in zip(trained, counts, strict=True) if number >= least]
 
 
 def rehearsed(
     views: Sequence[View], max_side: int, count: int, stays: Gaussians, others: Gaussians
 ) -> list[TrainingView]:
-    """At most `count` renders of what stays, at views of earlier visits that trained the map, evenly chosen, with long
-    sides up to `max_side`. Pixels in which one of the others stands in front, or stood, do not count."""
-    trained = [view for view in views if not getattr(view, "held_out", False)]
-    chosen = np.unique(np.linspace(0, len(trained) - 1, min(count, len(trained))).round().astype(int))
+    """At most `count` or MOST renders of what stays, evenly chosen of `views`, with long sides up to `max_side`. Pixels
+    in which one of the others stands in front, or stood, do not count."""
+    chosen = np.unique(np.linspace(0, len(views) - 1, min(count, MOST, len(views))).round().astype(int))
     marked = Gaussians.concatenate([stays, others])
     white = (torch.arange(len(marked)) >= len(stays)).float()
     marked = replace(marked, sh=sh_from_rgb(white[:, None, None].expand(-1, 1, 3)))
     made = []
-    for view in (trained[n] for n in chosen):
+    for view in (views[n] for n in chosen):
         width, height = scaled_size(view, max_side)
         matrices = scaled_K(view, width, height), view.camera_from_world
         K, pose = (torch.from_numpy(matrix.astype(np.float32)) for matrix in matrices)

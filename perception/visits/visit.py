@@ -20,7 +20,9 @@ from perception.masks import MaskSource
 from perception.masks.stereo import StereoView
 from perception.pipeline.checkpoint import digest, training_mark
 from perception.pipeline.optimise import Photos, Run, label_photos
+from perception.types import View
 from perception.visits.colours import grey_photo, in_grey, in_light, without_colours
+from perception.visits.evidence import seen_rows
 from perception.visits.look import (
     Look,
     compared,
@@ -34,11 +36,9 @@ from perception.visits.look import (
 from perception.visits.placing import checked_poses
 from perception.visits.record import as_it_was
 from perception.visits.registration import compact
-from perception.visits.rehearsal import rehearsed
+from perception.visits.rehearsal import rehearsed, showing
 from perception.visits.scene import foreign_photos, refuse_older, visit_scene
 
-MOST = 64
-"""Renders of what earlier visits saw: half a megapixel each."""
 TENSORS = ("means", "quats", "log_scales", "opacity_logits", "sh", "features")
 """Of `Gaussians`, and fields of a map."""
 
@@ -53,7 +53,8 @@ class Visit:
     """The photos of a visit against the map. number: of the visit; rows [R]: of the map's Gaussians, those that a photo
     may show; gaussians: these as the visit sees them (`seen`), with instances ids [R]; light [3]: its colours over the
     map's; grey: whether brightness alone is compared, as either the photos or the map have no colours; photos: exposed
-    and labelled; stereo: depths of the training photos; masks: report; mark: of its training; left_out: names of photos
+    and labelled; stereo: depths of the training photos; earlier: views of
+    earlier visits that show what these see; masks: report; mark: of its training; left_out: names of photos
     that are not used, and why."""
 
     run: Run
@@ -65,6 +66,7 @@ class Visit:
     grey: bool
     photos: Photos
     stereo: list[StereoView | None]
+    earlier: list[View]
     masks: dict[str, Any]
     mark: str
     left_out: list[dict[str, str]]
@@ -79,9 +81,8 @@ class Visit:
         return self.gaussians.rows(torch.from_numpy(np.flatnonzero(chosen)))
 
     def rehearsed(self, stays: Gaussians, others: Gaussians) -> list[TrainingView]:
-        """As many renders of what earlier visits saw as there are photos, or MOST, see `rehearsal.rehearsed`."""
-        count = min(MOST, len(self.photos.views))
-        return rehearsed(self.gmap.views, self.run.config.photos.max_side, count, stays, others)
+        """Renders of what earlier visits saw, as many as there are photos, see `rehearsal.rehearsed`."""
+        return rehearsed(self.earlier, self.run.config.photos.max_side, len(self.photos.views), stays, others)
 
     def rows_of(self, instance: int) -> np.ndarray:
         """[R] rows of the map's Gaussians of an instance that are no strays."""
@@ -161,13 +162,15 @@ def open_visit(run: Run, gmap: Map, source: MaskSource, output: Path) -> Visit:
         left_out += _told(run, [{"name": name, "why": why} for name in foreign])
         run.progress.log(f"{len(photos.views)} photos of the visit; light {', '.join(f'{x:.2f}' for x in light)}")
         stereo = stereo_of(photos.training, photos.views, shown, run.progress)
+        seen = seen_rows(shown, lit.means.double().numpy(), lit.scales.max(dim=1).values.numpy())
+        earlier = showing(gmap.views, lit, seen)
     depths = {view.name: each for view, each in zip(photos.training, stereo, strict=True)}
     photos, masks = label_photos(
         run, photos, source, lambda view: depth_at(depths[view.name], view.photo.shape, confirmed=False)
     )
     number = len(gmap.info.get("visits") or [0])
     mark = digest(gmap.map_id, training_mark(run.source, run.config), source.identity)
-    return Visit(run, gmap, number, rows, lit, light, grey, photos, stereo, masks, mark, left_out)
+    return Visit(run, gmap, number, rows, lit, light, grey, photos, stereo, earlier, masks, mark, left_out)
 
 
 def _told(run: Run, left_out: Sequence[dict[str, str]]) -> list[dict[str, str]]:

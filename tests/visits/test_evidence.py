@@ -17,7 +17,7 @@ from perception.types import View
 from perception.visits.evidence import in_free_space, looked_at, signs_of
 from perception.visits.look import Look, in_view
 from perception.visits.record import with_parts
-from perception.visits.rehearsal import rehearsed
+from perception.visits.rehearsal import rehearsed, showing
 
 SHAPE = 40, 50
 BOX = np.s_[10:30, 10:40]
@@ -148,8 +148,7 @@ def test_what_is_rehearsed_is_the_render_but_where_something_new_stands_or_stood
     """A ball of 0.1 before the wall and one behind it: pixels of the first do not count, nor those past the wall."""
     front, behind = (replace(wall().rows(torch.arange(1)), log_scales=torch.full((1, 3), -3.0)) for _ in range(2))
     front.means[:], behind.means[:] = torch.tensor([0.1, 0.0, 1.0]), torch.tensor([0.1, 0.0, 3.0])
-    held: Any = SimpleNamespace(held_out=True)
-    both = rehearsed([*VIEWS, held], 160, 9, wall(), Gaussians.concatenate([front, behind]))
+    both = rehearsed(VIEWS, 160, 9, wall(), Gaussians.concatenate([front, behind]))
     plain = rehearsed(VIEWS, 160, 1, wall(), behind)
     assert [view.name for view in both] == ["rehearsed -0.2", "rehearsed 0.2"] and len(plain) == 1
     row, column = np.mgrid[:120, :160] + 0.5
@@ -162,6 +161,18 @@ def test_what_is_rehearsed_is_the_render_but_where_something_new_stands_or_stood
         image = render(wall(), view.camera_from_world, view.K, 160, 120, harmonics=True).colors[0]
         assert np.abs(view.photo.numpy() / 255 - image.numpy()).max() < 0.003
     assert (plain[0].weight.numpy()[(np.abs(row - 60) < 25) & (np.abs(column - 95) < 40)] == 1).all()
+
+
+def test_views_of_the_other_side_of_a_wall_are_not_rehearsed() -> None:
+    """A poster 30 cm before a wall, and cameras on both sides; one looks away, one was held out of training."""
+    poster = replace(wall(), means=wall().means * 0.3 + torch.tensor([0, 0, 1.1]))
+    both = Gaussians.concatenate([wall(), poster])
+    behind = np.diag([-1.0, 1, -1, 1])
+    behind[:3, 3] = -behind[:3, :3] @ [0, 0, 4.0]
+    away = replace(VIEWS[0], camera_from_world=np.diag([-1.0, 1, -1, 1]))
+    held: Any = SimpleNamespace(held_out=True)
+    views = [*VIEWS, replace(VIEWS[0], camera_from_world=behind), away, held]
+    assert showing(views, both, np.arange(len(both)) >= len(wall())) == VIEWS
 
 
 def test_what_two_photos_see_through_is_free_space() -> None:
