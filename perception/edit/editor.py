@@ -55,7 +55,8 @@ def _step(method: F) -> F:
 
 
 class Editor:
-    """A map and its edit history. Instances are named by their `id`, which never changes; merged ones get a new id.
+    """A map and its edit history. Instances are named by their `id`, which never changes; merged ones get a new id,
+    which nothing else had before, in this map or the ones that it was made from.
 
     Edits raise InputError for an id that the map does not have.
 
@@ -73,7 +74,7 @@ class Editor:
     def __init__(self, path: Path):
         self.path = Path(path) if Path(path).name else Path(path).absolute()
         self._lock = threading.RLock()
-        self._last_id = -1  # the largest id that was ever given here
+        self._next = 0  # above all ids that were ever given here
         self.reopen()
 
     @_step
@@ -86,7 +87,7 @@ class Editor:
         self._past = [_State("opened", gmap.instance_ids, tuple(gmap.instances), tuple(descriptions))]
         self._future: list[_State] = []
         self._saved = self._past[0]
-        self._last_id = max([self._last_id, *(entry["id"] for entry in gmap.instances), *self._known_parts()])
+        self._next = max(self._next, gmap.next_id)
 
     # ------------------------------------------------------------------ reading
 
@@ -149,6 +150,7 @@ class Editor:
             instance_ids=now.ids,
             membership=np.where(now.ids >= 0, self.original.membership, 0).astype(np.float32),
             instances=list(now.instances),
+            info={**self.original.info, "next_id": self._next},
             language=to_arrays(now.descriptions, self._encoder) if self._encoder else {},
             parts=self._parts_now(),
             groups=self.original.groups if same else {},
@@ -303,9 +305,9 @@ class Editor:
         return cluster_gaussians(gmap.means[rows], gmap.scales[rows], gmap.opacities[rows], gmap.features[rows], finer)
 
     def _next_id(self) -> int:
-        if self._last_id >= LARGEST:
+        if self._next > LARGEST:
             raise InputError(f"{self.path}: has the id {LARGEST}, the largest; there is none left for another instance")
-        return self._last_id + 1
+        return self._next
 
     def _entry(self, instance: int, ids: np.ndarray, score: float, views: int, label: Any = None) -> dict[str, Any]:
         gmap, rows = self.original, ids == instance
@@ -324,7 +326,7 @@ class Editor:
         descriptions = now.descriptions
         if descriptions:
             descriptions = spliced(descriptions, [_joined([descriptions[row] for row in rows])] * len(new))
-        self._last_id = max([self._last_id, *(entry["id"] for entry in new)])
+        self._next = max([self._next, *(entry["id"] + 1 for entry in new)])
         self._push(what, ids=ids, instances=spliced(now.instances, new), descriptions=descriptions)
 
 

@@ -198,6 +198,13 @@ class Map:
         return self._id if self.files is None else self.files.map_id
 
     @property
+    def next_id(self) -> int:
+        """The id of the next new instance: above those of all instances and parts, also of removed ones, which
+        `next_id` of map.json tells."""
+        used = (one["id"] for entry in self.instances for one in (entry, *entry.get("parts", ())))
+        return max([self.info.get("next_id", 0), *(i + 1 for i in used)])
+
+    @property
     def newest_visit(self) -> int:
         """The number of the newest visit (see `map.history`), 0 in a map of one."""
         return len(self.info.get("visits") or [0]) - 1

@@ -55,7 +55,7 @@ _SCALE = typed({"metres_per_unit": Positive, "standard_error": Length | None, "s
 _GRAVITY = typed({"direction": Direction, "standard_error_deg": Length, "source": PathText})
 FACTS = typed({
     "format_version": int, "num_gaussians": Count, "num_instances": Count, "sh_degree": Count,
-    "frame?": Text, "metric?": bool, "source?": PathText, "seed?": Bytes,
+    "next_id?": Bytes, "frame?": Text, "metric?": bool, "source?": PathText, "seed?": Bytes,
     "config?": {
         "language?": {"encoder?": PathText, "zooms?": Count, "texts?": Text},
         "photos?": {"max_side?": Annotated[int, Field(ge=16, le=65536)]},

@@ -306,8 +306,7 @@ def _settled(
     parts = gmap.parts["ids"] if "ids" in gmap.parts else np.full(len(gmap), -1, np.int32)
     part_ids = np.concatenate([parts[kept], np.full(len(grown) - len(kept), -1, np.int32)])
     taken = {j for j, _ in pairs.values()} | pieces
-    used = [entry["id"] for entry in gmap.instances] + [p["id"] for e in gmap.instances for p in e.get("parts", ())]
-    following, added = max(used, default=-1) + 1, dict[int, tuple[float, New]]()
+    following, added = gmap.next_id, dict[int, tuple[float, New]]()
     fresh = np.arange(len(kept), len(grown))
     looked, through = looked_at(as_gaussians(gmap), gmap.views, grown.means[fresh].double().numpy())
     for j, (rows, score) in enumerate(things):

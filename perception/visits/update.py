@@ -164,6 +164,7 @@ def assembled(visit: Visit, today: Today, described: DescribedInstances, output:
     seconds = {**run.seconds, "total": time.monotonic() - run.started}
     info |= {"quality": quality, "config": run.config.to_json(), "fingerprint": mark, "seconds": seconds}
     info["instances"] = {**info.get("instances", {}), "count": len(instances)}
+    info["next_id"] = max([gmap.next_id, *(i + 1 for i in today.added)])
     info |= {"training": asdict(today.record), "masks": visit.masks, "peak_memory_mib": peak_memory_mib()}
     scene, left_out = info.get("scene", {}), [{**entry, "name": prefix + entry["name"]} for entry in visit.left_out]
     info["scene"] = {**scene, "left_out": [*scene.get("left_out", []), *left_out]}

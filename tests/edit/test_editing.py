@@ -11,7 +11,7 @@ from perception.edit.editor import Editor
 from perception.errors import InputError
 from perception.language.colors import PALETTE
 from perception.language.description import InstanceDescription, to_arrays
-from perception.map.write import Map, read_map, write_map
+from perception.map.write import Map, read_map, set_labels, write_map
 
 
 @pytest.fixture
@@ -108,6 +108,31 @@ def test_an_id_that_was_saved_and_undone_is_given_to_nothing_else(path: Path) ->
     editor.undo()
     editor.rename(2, "cup")  # what was undone is forgotten
     assert editor.merge([1, 2]) > first
+
+
+def test_an_id_is_given_once_in_the_history_of_a_map(path: Path) -> None:
+    """Each map on disk, and each map after it by another editor, by labels or without: against a list of all ids."""
+    given = {entry["id"] for entry in read_map(path).instances}
+
+    def new(ids: list[int]) -> list[int]:
+        assert not given & set(ids)
+        given.update(ids)
+        return ids
+
+    editor = Editor(path)
+    new([editor.merge([0, 1])])
+    editor.save()
+    editor.undo()
+    editor.save()  # without the joined one
+    set_labels(path, {2: "cup"})
+    editor = Editor(path)
+    parts = new(editor.split(2))
+    editor.save()
+    editor.remove(parts[1])
+    editor.save()
+    assert Editor(path).current().next_id == max(given) + 1  # by which an update names what is new
+    editor = Editor(path)
+    new([editor.merge([0, 1])])
 
 
 def test_split_finds_the_two_halves(path: Path) -> None:

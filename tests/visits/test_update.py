@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from perception.cli import main
 from perception.config import load_config
+from perception.edit.editor import Editor
 from perception.errors import InputError
 from perception.gaussians.model import as_gaussians
 from perception.gaussians.views import render
@@ -46,6 +47,11 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     first = folder / "visit0"
     settings = ["train.iterations=700", "language.encoder=none", "language.texts=off"]
     build_map(first, folder / "old.gsmap", load_config(None, [f"masks=labels:{first / 'labels'}", *settings]))
+    editor = Editor(folder / "old.gsmap")
+    editor.merge([entry["id"] for entry in editor.instances[:2]])
+    editor.save()
+    editor.undo()
+    editor.save()  # an id was given, and nothing has it
     return folder
 
 
@@ -98,6 +104,13 @@ def test_what_stays_keeps_its_ids_and_its_geometry(world: Path, new: Map) -> Non
     stays = [i for i in range(len(old)) if old.instance_ids[i] not in gone]
     found = [rows.get(b"".join(getattr(old, n)[i].tobytes() for n in names)) for i in stays]
     assert found == old.instance_ids[stays].tolist()
+
+
+def test_what_is_new_has_an_id_that_nothing_had(world: Path, new: Map) -> None:
+    before = read_map(world / "old.gsmap").instances
+    first = max(part["id"] for entry in before for part in (entry, *entry.get("parts", ()))) + 2
+    came = [entry["id"] for entry in new.instances[len(before) :]]
+    assert came == [*range(first, first + len(came))] != [] and new.next_id == first + len(came)
 
 
 def test_scores_are_of_the_visits_own_photos_and_seconds_have_a_total(new: Map) -> None:
