@@ -23,10 +23,9 @@ from perception.geometry import check_similarity, move_points, scale_of
 from perception.io.atomic import write_file
 from perception.io.cloud import read_cloud, storable, write_cloud
 from perception.io.documents import refusing
-from perception.map.files import read_info
 from perception.map.history import is_removed
 from perception.map.write import Map, read_map
-from perception.photos.view_json import refuse_other_unit, unit_of
+from perception.photos.view_json import frame_facts, refuse_other_frame
 from perception.types import PointCloud
 
 if TYPE_CHECKING:
@@ -86,16 +85,17 @@ def aligned(gmap: Map, scan: PointCloud, name: str) -> tuple[np.ndarray, dict[st
     return found.map_from_scan, {"verdict": "accepted", **{key: round(getattr(found, key), 6) for key in names}}
 
 
-def read_transform(path: Path, info: dict[str, Any]) -> np.ndarray:
+def read_transform(path: Path, gmap: Map) -> np.ndarray:
     """map_from_scan [4, 4] float64: four rows of four numbers as text or JSON, or a JSON object that holds them as
     `map_from_scan`, as `export` writes. InputError unless it is a rotation, a positive scale and a translation, and
-    where the map has another unit since `export` wrote it. info: of map.json."""
+    where `export` wrote it for another map, or the map has another unit since."""
     with refusing(f"{path}: expected a 4 × 4 matrix as text or JSON ({{why}})"):
         text = path.read_text(encoding="utf-8-sig")
         if text.lstrip()[:1] in ("[", "{"):
             rows = json.loads(text)
             if isinstance(rows, dict):
-                refuse_other_unit(path, rows.get("map_unit", {}), info, "align the scan again")
+                of_map = rows.get("map_unit", {})
+                refuse_other_frame(path, of_map, gmap.info, gmap.views, "align the scan again")
                 rows = rows["map_from_scan"]
         else:
             lines = (line.replace(",", " ").split() for line in text.splitlines())
@@ -144,8 +144,9 @@ def export_map(
         raise InputError(f"{output}: unknown kind of cloud '{output.suffix}', expected one of {', '.join(SUFFIXES)}")
     if pose and points is None:
         raise InputError("--align and --transform need a scan; give it with --points")
-    known = None if isinstance(pose, bool) else read_transform(pose, read_info(map_path))
-    gmap = read_map(map_path)
+    gmap = Map.open(map_path)
+    known = None if isinstance(pose, bool) else read_transform(pose, gmap)
+    gmap.load()
     ids, instances = at_granularity(gmap, granularity)
     cloud = None if points is None else read_cloud(points)
     map_from_cloud = map_from_input(map_path, gmap.info)
@@ -157,7 +158,7 @@ def export_map(
     elif pose and cloud is not None:
         map_from_cloud, facts["alignment"] = aligned(gmap, cloud, str(points))
     if pose:
-        facts |= {"map_from_scan": map_from_cloud.tolist(), "map_unit": unit_of(gmap.info)}
+        facts |= {"map_from_scan": map_from_cloud.tolist(), "map_unit": frame_facts(gmap.info, gmap.views)}
     moved = not np.array_equal(map_from_cloud, np.eye(4))
     means = move_points(np.linalg.inv(map_from_cloud), gmap.means.astype(np.float64)) if moved else gmap.means
     began = time.perf_counter()

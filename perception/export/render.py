@@ -52,7 +52,7 @@ def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[st
         views = map_views(gmap)
     else:
         views = _cameras(cameras)
-        if not in_map_frame(cameras, gmap.info):
+        if not in_map_frame(cameras, gmap.info, gmap.views):
             views = [moved(view, map_from_input(map_path, gmap.info)) for view in views]
     files = _picture_names([safe_name(view.name, cameras or map_path) for view in views])  # no path outside `output`
     folders = {kind: output if len(what) == 1 else output / kind for kind in what}

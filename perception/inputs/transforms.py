@@ -6,6 +6,7 @@ import contextlib
 import math
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from perception.photos.decode import SUFFIXES, photo_size, why_left_out
 from perception.photos.ignore_masks import mask_of
 from perception.photos.lens import FISHEYE, PERSPECTIVE, camera_from_lens, opencv_lens
 from perception.photos.named_files import NamedFiles
-from perception.photos.view_json import absolute, refuse_other_unit
+from perception.photos.view_json import absolute, refuse_other_frame
 from perception.photos.views import first_of, posed_view, rigid_pose, without_far
 from perception.sfm.options import NO_CLOUD, ReadOptions
 from perception.sfm.triangulate import posed_scene
@@ -67,6 +68,8 @@ def read_transforms(source: Path, options: ReadOptions) -> Scene:
     facts["mean_reprojection_error_px"] = None
     if options.cloud is None and listed is not None:
         facts["points_from"] = str(data["ply_file_path"])
+    if isinstance(data.get("frame_id"), str):  # of the map in which `perception localise` found the poses
+        facts["frame_id"] = data["frame_id"]
     held = sum(view.held_out for view in views)
     split = f"; {held} of {len(views)} photos are of its test and val parts" if held else ""
     facts["notes"] = [f"poses of {file.parent}: {', '.join(each.name for each in files)}{split}"]
@@ -122,13 +125,16 @@ def read_frames(file: Path) -> list[tuple[str, np.ndarray, Lens]]:
     return [(str(values["file_path"]), _pose(file, values), _lens(file, values, None)) for values in frames]
 
 
-def in_map_frame(file: Path, info: dict[str, Any]) -> bool:
-    """Whether its poses are in the frame of a map, as `perception localise` writes them, not in that of an input.
-    info: of map.json. InputError where the map has had another unit then."""
+def in_map_frame(file: Path, info: dict[str, Any], views: Sequence[View]) -> bool:
+    """Whether its poses are in the frame of a map, as `perception localise` writes them, not in that of its input.
+    info: of map.json; views: of the map. InputError where they are in another map's frame, or the map has had another
+    unit then."""
     data = read_json(file)
     if not isinstance(data, dict) or "map_id" not in data:
         return False
-    refuse_other_unit(file, data, info, "run perception localise again")
+    if "frame_id" in data and data["frame_id"] == info.get("scene", {}).get("frame_id"):
+        return False
+    refuse_other_frame(file, data, info, views, "run perception localise again")
     return True
 
 

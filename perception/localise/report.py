@@ -15,7 +15,7 @@ from perception.localise.localiser import Localised, Localiser, NotHere
 from perception.localise.photos import new_photos, transforms_of
 from perception.map.map import Map
 from perception.map.outputs import refuse_inputs
-from perception.photos.view_json import unit_of
+from perception.photos.view_json import frame_facts
 from perception.progress import Progress
 
 
@@ -38,7 +38,7 @@ def localise_photos(
     facts |= {"map_id": gmap.map_id, "rendered": localiser.rendered}
     found = [answer for answer in answers if isinstance(answer, Localised)]
     if output is not None and found:
-        head = {"map_id": gmap.map_id, "frame": gmap.frame, **unit_of(gmap.info)}
+        head = {"map_id": gmap.map_id, "frame": gmap.frame, **frame_facts(gmap.info, gmap.views)}
         write_file(output, json.dumps(transforms_of(found, output, head), indent=1) + "\n")
     return facts, _lines(answers, gmap, localiser.rendered)
 

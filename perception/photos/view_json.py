@@ -8,7 +8,9 @@ took it (see `map.history`), 0 when it is missing.
 
 from __future__ import annotations
 
+import hashlib
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -176,12 +178,21 @@ def _lens_of(entry: list[Any] | None) -> Lens | None:
     return None if entry is None else Lens(entry[0], tuple(map(float, entry[1])), *entry[2:])
 
 
-def refuse_other_unit(file: Path, data: dict[str, Any], info: dict[str, Any], todo: str) -> None:
-    """InputError where `data` in a file have `unit_of` a map that has had another unit since. info: of its map.json."""
-    if any(key in data and data[key] != value for key, value in unit_of(info).items()):
-        raise InputError(f"{file}: is in another unit than the map has now; {todo}")
+def refuse_other_frame(
+    file: Path, data: dict[str, Any], info: dict[str, Any], views: Sequence[View], todo: str
+) -> None:
+    """InputError where `data` in a file have the `frame_facts` of a map that has had another unit since, or of another
+    one. info: of its map.json; views: of the map."""
+    now = frame_facts(info, views)
+    differ = [key for key, value in now.items() if key in data and data[key] != value]
+    if differ:
+        found = "another unit than the map has now" if differ != ["frame_id"] else "the frame of another map"
+        raise InputError(f"{file}: is in {found}; {todo}")
 
 
-def unit_of(info: dict[str, Any]) -> dict[str, Any]:
-    """What map.json tells of the unit."""
-    return {"metric": info.get("metric", False), "scale": info.get("scale")}
+def frame_facts(info: dict[str, Any], views: Sequence[View]) -> dict[str, Any]:
+    """What map.json tells of the unit, and `frame_id`: where the map's first visit took its photos, as a hash. No
+    correction, update or upgrade of a map changes it."""
+    poses = [v.camera_from_world for v in views if not (isinstance(v, StoredView) and v.visit)]
+    digest = hashlib.sha256(np.array(poses, np.float64).tobytes()).hexdigest()[:12]
+    return {"metric": info.get("metric", False), "scale": info.get("scale"), "frame_id": digest}

@@ -14,7 +14,7 @@ from perception.frame.recentre import map_from_input, moved
 from perception.geometry import move_points
 from perception.inputs.load import load_scene
 from perception.inputs.readers import reader_of
-from perception.inputs.transforms import in_map_frame
+from perception.inputs.transforms import in_map_frame, transforms_files
 from perception.localise.localiser import Localised, Localiser
 from perception.localise.photos import new_photos
 from perception.localise.report import rendered_notice
@@ -112,8 +112,8 @@ def _all_views(run: Run, gmap: Map, output: Path) -> Scene:
     scene = load_scene(source, options)
     if not scene.views:
         raise InputError(f"{source}: holds no posed photo; give photos of a new visit")
-    placed = source / "transforms.json" if source.is_dir() else source
-    if placed.suffix == ".json" and placed.is_file() and in_map_frame(placed, gmap.info):
+    listed = transforms_files(source) if scene.report.get("input") == "transforms" else []
+    if listed and in_map_frame(listed[0], gmap.info, gmap.views):
         return scene
     return replace(scene, views=[moved(view, b_from_a) for view in scene.views])
 

@@ -16,17 +16,22 @@ from PIL import Image
 
 import perception
 from perception.cli import main
+from perception.config import MapConfig
 from perception.errors import InputError
-from perception.inputs.transforms import in_map_frame, lens_values, read_frames
+from perception.frame.recentre import moved
+from perception.inputs.transforms import in_map_frame, lens_values, read_frames, read_transforms
 from perception.localise.photos import new_photos
 from perception.map.files import MapFiles
 from perception.map.map import Map
 from perception.map.write import read_map, write_map
 from perception.photos.camera_file import camera_data
 from perception.photos.lens import camera_from_lens
-from perception.photos.view_json import unit_of
+from perception.photos.view_json import frame_facts
+from perception.pipeline.optimise import Run
 from perception.progress import QUIET
+from perception.sfm.options import ReadOptions
 from perception.types import Lens
+from perception.visits.scene import visit_scene
 from support.painted_room import FOCAL, PaintedRoom, difference, walk, write_room_map
 from support.splat_rooms import room_columns, write_room
 
@@ -58,7 +63,9 @@ def test_poses_as_json_and_as_a_file_in_the_maps_frame(folder: Path, capsys: pyt
     ]  # fmt: skip
     assert (facts["frame"], facts["metric"], facts["rendered"]) == ("map", True, [])
     frames = read_frames(folder / "out.json")
-    assert in_map_frame(folder / "out.json", facts) and [name for name, _, _ in frames] == ["new/0.png", "new/1.png"]
+    gmap = Map.open(folder / "a.gsmap")
+    assert in_map_frame(folder / "out.json", gmap.info, gmap.views)
+    assert [name for name, _, _ in frames] == ["new/0.png", "new/1.png"]
     for photo, (_, pose, lens), truth in zip(facts["photos"], frames, TRUTH, strict=False):
         assert np.allclose(pose, photo["camera_from_map"]) and lens.params[0] == 300
         assert difference(pose, truth)[0] < 0.003
@@ -176,15 +183,49 @@ def test_rendering_takes_such_a_file_as_in_the_maps_frame(folder: Path, tmp_path
     assert seen["of_map"] > 100 and seen["of_input"] == 0
 
 
+@pytest.mark.parametrize("name", ["transforms.json", "poses.json"])
+def test_an_update_takes_such_a_file_as_in_the_maps_frame(folder: Path, tmp_path: Path, name: str) -> None:
+    """Whatever its name is in the folder of the photos; the map's frame lies a kilometre from that of its input."""
+    shutil.copytree(folder / "new", tmp_path / "new")
+    gmap, far = read_map(folder / "a.gsmap"), np.eye(4)
+    far[0, 3] = 1000.0
+    gmap.info["map_from_input"] = far.tolist()
+    pose = (np.linalg.inv(TRUTH[0]) @ np.diag([1.0, -1, -1, 1])).tolist()
+    frame = {"file_path": "0.png", "transform_matrix": pose, **lens_values(LENS)}
+    for head, moved_by in (({"map_id": gmap.map_id, **frame_facts(gmap.info, gmap.views)}, 0.0), ({}, 1000.0)):
+        (tmp_path / "new" / name).write_text(json.dumps({**head, "frames": [frame]}))
+        run = Run.begun(tmp_path / "new", MapConfig(), tmp_path, QUIET)
+        (view,) = visit_scene(run, gmap, tmp_path / "b.gsmap").views
+        away = np.linalg.inv(view.camera_from_world)[:3, 3] - np.linalg.inv(TRUTH[0])[:3, 3]
+        assert np.allclose(away, [moved_by, 0, 0], atol=1e-6)
+
+
 def test_poses_in_the_map_before_it_was_scaled_are_refused(folder: Path, tmp_path: Path) -> None:
     """They would be taken for poses in its new unit."""
     gmap, poses = Map.open(folder / "a.gsmap"), tmp_path / "poses.json"
     for scale, again in ((None, {"metric": False}), ({"metres_per_unit": 1.0}, {"scale": None})):
         info = {**gmap.info, "scale": scale}
-        poses.write_text(json.dumps({"map_id": "before", **unit_of(info), "frames": []}))
-        assert in_map_frame(poses, info)
+        poses.write_text(json.dumps({"map_id": "before", **frame_facts(info, gmap.views), "frames": []}))
+        assert in_map_frame(poses, info, gmap.views)
         with pytest.raises(InputError, match="another unit"):
-            in_map_frame(poses, {**info, **again})
+            in_map_frame(poses, {**info, **again}, gmap.views)
+
+
+def test_poses_in_another_map_are_refused_unless_that_is_the_input(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Another map of the same room and unit, half a metre aside; names, corrections and updates keep the frame."""
+    told(capsys, folder / "a.gsmap", folder / "new/0.png", "-o", tmp_path / "a.json")
+    aside = np.eye(4)
+    aside[0, 3] = 0.5
+    gmap, poses = read_map(folder / "a.gsmap"), tmp_path / "a.json"
+    other = [moved(view, aside) for view in gmap.views]
+    assert in_map_frame(poses, gmap.info, [*gmap.views, replace(gmap.views[0], visit=1)])  # type: ignore[call-arg]
+    with pytest.raises(InputError, match=r"a\.json: is in the frame of another map; run perception localise again"):
+        in_map_frame(poses, gmap.info, other)
+    scene = read_transforms(poses, ReadOptions(tmp_path, cloud=(np.zeros((1, 3)), np.zeros((1, 3), np.uint8))))
+    made_of_it = {**gmap.info, "scene": scene.report}
+    assert not in_map_frame(poses, made_of_it, other)  # they are moved as the input was
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,10 @@ from scipy.spatial.transform import Rotation
 from perception.cli import main
 from perception.errors import InputError
 from perception.export.export_map import read_transform
+from perception.frame.recentre import moved
 from perception.io.cloud import read_cloud, write_cloud
 from perception.io.open3d import load_open3d
+from perception.map.map import Map
 from perception.map.write import write_map
 from perception.query import load_map
 from perception.types import PointCloud
@@ -61,13 +63,18 @@ def test_a_known_transform_places_the_scan_which_keeps_its_frame(path: Path, tmp
     np.testing.assert_allclose(json.loads((tmp_path / "out.json").read_text())["map_from_scan"], rows)
 
 
-def test_a_place_in_the_map_before_it_was_scaled_is_refused(path: Path, tmp_path: Path, capsys: Any) -> None:
+def test_a_place_in_another_map_or_before_it_was_scaled_is_refused(path: Path, tmp_path: Path, capsys: Any) -> None:
     write_cloud(tmp_path / "scan.ply", PointCloud(small_map().means.astype(np.float64)))
     np.savetxt(tmp_path / "place.txt", np.eye(4))
     words = ["export", str(path), "--points", str(tmp_path / "scan.ply"), "--no-smooth", "-o"]
     assert main([*words, str(tmp_path / "out.ply"), "--transform", str(tmp_path / "place.txt")]) == 0
     again = [*words, str(tmp_path / "again.ply"), "--transform", str(tmp_path / "out.json")]
     assert main(again) == 0
+    other = small_map()
+    other.views = [moved(view, np.linalg.inv(SCAN_FROM_MAP)) for view in other.views]
+    write_map(tmp_path / "other.gsmap", other)
+    assert main([again[0], str(tmp_path / "other.gsmap"), *again[2:]]) == 2
+    assert "out.json: is in the frame of another map; align the scan again" in capsys.readouterr().err
     assert main(["scale", str(path), "--known-length", "1.1: 0,0,0 0,0,1"]) == 0
     assert main(again) == 2
     assert "out.json: is in another unit than the map has now; align the scan again" in capsys.readouterr().err
@@ -89,7 +96,7 @@ def test_a_place_in_the_map_before_it_was_scaled_is_refused(path: Path, tmp_path
 def test_other_transforms_are_refused(text: str, told: str, tmp_path: Path) -> None:
     (tmp_path / "t.txt").write_text(text)
     with pytest.raises(InputError, match=told) as caught:
-        read_transform(tmp_path / "t.txt", {})
+        read_transform(tmp_path / "t.txt", Map())
     assert "t.txt" in str(caught.value)
 
 
