@@ -38,19 +38,33 @@ class Settings(BaseModel):
         return value
 
 
-def absolute_paths(value: str | None) -> str | None:
+def absolute_paths(value: str, folder: Path = Path()) -> str:
     """A setting that names files, as PATH, KIND:PATH or KIND:PATH,PATH: what exists as absolute paths, so that it means
-    the same files in another folder; all else, such as the name of a stored model, as it is.
+    the same files in another folder; all else, such as the name of a stored model, as it is. folder: that to which
+    paths are relative.
 
     >>> absolute_paths("sam:mobilesam")
     'sam:mobilesam'
     """
-    if value is None:
-        return None
     kind, colon, named = value.partition(":") if value.startswith(("labels:", "sam:", "clip:")) else ("", "", value)
-    exists = os.path.exists  # Path.exists raises for a name that is too long
-    parts = [named] if exists(named) else named.split(",")
-    return kind + colon + ",".join(str(Path(p.strip()).absolute()) if exists(p.strip()) else p for p in parts)
+
+    def found(part: str) -> str | None:
+        path = folder / part  # Path.exists raises for a name that is too long
+        return str(path.absolute()) if part and os.path.exists(path) else None  # noqa: PTH110
+
+    return kind + colon + (found(named) or ",".join(found(part.strip()) or part for part in named.split(",")))
+
+
+def _path_settings(*names: str) -> Any:
+    """A validator of settings that name files, relative to the `folder` of `settings_from`. Words such as "auto" name
+    none where a KIND is expected before a path."""
+
+    def absolute(value: str | None, info: ValidationInfo) -> str | None:
+        if value is None or (info.field_name in ("masks", "encoder") and ":" not in value):
+            return value
+        return absolute_paths(value, (info.context or {}).get("folder", Path()))
+
+    return field_validator(*names)(absolute)
 
 
 class PhotoConfig(Settings):
@@ -72,7 +86,7 @@ class PhotoConfig(Settings):
         "auto", description="given poses: refined where matched features show that they are wrong, kept, or refined"
     )
     strict: bool = Field(False, description="refuse a damaged photo instead of leaving it out")
-    _absolute = field_validator("held_out", "camera", "ignore_masks", "init_points")(absolute_paths)
+    _absolute = _path_settings("held_out", "camera", "ignore_masks", "init_points")
     memory: str | None = Field(
         None,
         pattern=r"^[1-9][0-9]*[MG]$",
@@ -95,7 +109,7 @@ class SplatConfig(Settings):
     cameras: str | None = Field(None, description="of a finished splat: COLMAP model or transforms.json, used first")
     up: str | None = Field(None, description="of a finished splat: z, -y, ... or X,Y,Z; none: as its floor lies")
     unit: str | None = Field(None, pattern="^metre$", title="metre", description="of a finished splat, if known")
-    _absolute = field_validator("cameras")(absolute_paths)
+    _absolute = _path_settings("cameras")
 
 
 class SamConfig(Settings):
@@ -173,7 +187,7 @@ class LanguageConfig(Settings):
     texts: Literal["auto", "on", "off"] = Field(
         "auto", description="reading of printed texts; auto: if the extra ocr is installed"
     )
-    _absolute = field_validator("encoder")(absolute_paths)
+    _absolute = _path_settings("encoder")
 
 
 class MapConfig(Settings):
@@ -197,7 +211,7 @@ class MapConfig(Settings):
     losses: LossConfig = LossConfig()
     instances: InstanceConfig = InstanceConfig()
     language: LanguageConfig = LanguageConfig()
-    _absolute = field_validator("masks")(absolute_paths)
+    _absolute = _path_settings("masks")
 
     def part(self, share: float) -> MapConfig:
         """The settings of one of several trainings of a run, which has `share` of the time limit if there is one."""
@@ -262,9 +276,10 @@ def load_config(
     pairs: list[str] | None = None,
     preset: str = "default",
     given: Mapping[str, tuple[Any, str]] | None = None,
+    folder: Path = Path(),
 ) -> MapConfig:
     """Defaults, overridden by the preset, `given` settings (see `settings_from`), the TOML file and KEY=VALUE pairs.
-    Raises InputError for the first error.
+    folder: that to which paths in settings are relative. Raises InputError for the first error.
 
     >>> config = load_config(pairs=["train.iterations=500", "masks=labels:labels"], preset="fast")
     >>> config.train.iterations, config.train.effort, config.masks
@@ -276,11 +291,12 @@ def load_config(
     if file is not None:
         given |= {key: (value, str(file)) for key, value in flat(read_toml(file))}
     given |= {key: (text, "--set") for key, text in read_pairs(pairs or []).items()}
-    return settings_from(MapConfig, given)
+    return settings_from(MapConfig, given, folder)
 
 
-def settings_from(model: type[AnySettings], given: Mapping[str, tuple[Any, str]]) -> AnySettings:
-    """The model with the given settings: dotted key -> (value, where it was read, for the error message).
+def settings_from(model: type[AnySettings], given: Mapping[str, tuple[Any, str]], folder: Path = Path()) -> AnySettings:
+    """The model with the given settings: dotted key -> (value, where it was read, for the error message). folder: that
+    to which their paths are relative.
 
     Raises InputError with key, value and range for the first setting that is unknown, of another type or out of range.
     """
@@ -292,7 +308,7 @@ def settings_from(model: type[AnySettings], given: Mapping[str, tuple[Any, str]]
         group, _, name = key.rpartition(".")
         (nested.setdefault(group, {}) if group else nested)[name] = value
     try:
-        return model.model_validate(nested)
+        return model.model_validate(nested, context={"folder": folder})
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False)[0]
         key = next(key for key in known if key.split(".") == list(first["loc"])[: key.count(".") + 1])

@@ -39,6 +39,11 @@ def test_files_are_the_same_from_another_folder(tmp_path: Path, monkeypatch: pyt
     assert config.language.encoder == f"clip:{tmp_path}/a.onnx,{tmp_path}/b.onnx"
     assert config.photos.held_out == "no, such.txt" and config.splat.cameras is None
     assert load_config(pairs=["masks=sam:mobilesam"]).masks == "sam:mobilesam"
+    (tmp_path / "builtin").mkdir()
+    (tmp_path / "none").mkdir()
+    words = load_config(pairs=["masks=builtin", "language.encoder=none"])
+    assert (words.masks, words.language.encoder) == ("builtin", "none")
+    assert load_config(pairs=["masks=sam:a.onnx,"]).masks == f"sam:{tmp_path}/a.onnx,"
 
 
 def test_the_papers_preset_is_the_published_method() -> None:

@@ -22,7 +22,7 @@ _WORDS = {"None": "none", "True": "on", "False": "off"}
 
 
 class Job(Settings):
-    """One map: its input and output, paths relative to the list; its settings as `perception map` has them."""
+    """One map: its input, output and settings as `perception map` has them; all paths are relative to the list."""
 
     input: str
     output: str
@@ -73,7 +73,7 @@ def read_jobs(file: Path) -> list[dict[str, Any]]:
             raise InputError(f"{where}: has the output of job {other}, {output}")
         known[name] = number
         try:
-            config = load_config(settings, pairs, job.preset)
+            config = load_config(settings, pairs, job.preset, folder=file.parent)
         except InputError as error:
             raise InputError(f"{where}: {error}") from error
         jobs.append({"input": str(source), "output": str(output), "settings": config.to_json()})

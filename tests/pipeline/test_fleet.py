@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from perception.cli import main
-from perception.config import load_config
+from perception.config import MapConfig, load_config
 from perception.errors import InputError
 from perception.map.write import Map
 from perception.pipeline import fleet
@@ -174,3 +174,22 @@ def test_values_of_yaml_are_words_of_settings(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"jobs\.yaml, job 2: --set train\.iterations"):
         read_jobs(written(tmp_path, [{"input": ".", "output": f"{n}.gsmap", "set": {"train.iterations": x}} for n, x in
                                      enumerate((3, "many"))]))  # fmt: skip
+
+
+def test_paths_in_settings_are_relative_to_the_list(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also those of a job's TOML file, and where the folder in which the command runs has such files, too."""
+    for folder in (tmp_path / "lists", tmp_path / "here"):
+        for name in ("labels", "model", "config"):
+            (folder / name).mkdir(parents=True)
+        (folder / "camera.yaml").touch()
+    (tmp_path / "lists/config/c.toml").write_text('photos.camera = "camera.yaml"\n')
+    set_ = {"masks": "labels:labels", "language.encoder": "clip:model"}
+    written(tmp_path / "lists", [{"input": ".", "output": "a.gsmap", "config": "config/c.toml", "set": set_}])
+    monkeypatch.chdir(tmp_path / "here")
+    for file in (Path("../lists/jobs.yaml"), tmp_path / "lists/jobs.yaml"):
+        (job,) = read_jobs(file)
+        settings = MapConfig.model_validate(job["settings"])  # as a worker reads them
+        found = (settings.masks, settings.language.encoder, settings.photos.camera)
+        assert [Path(str(text).rpartition(":")[2]).resolve() for text in found] == [
+            tmp_path / "lists" / name for name in ("labels", "model", "camera.yaml")
+        ]
