@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from perception.config import MapConfig, fields, flat, load_config, read_pairs
+from perception.config import MapConfig, fields, flat, load_config, read_pairs, read_toml
 from perception.errors import InputError
 from perception.frame.recentre import map_from_input, moved
 from perception.geometry import move_points
@@ -50,8 +50,10 @@ OTHER_UNIT = 1.5
 
 def update_settings(path: Path, file: Path | None, pairs: list[str]) -> MapConfig:
     """The settings that the map at `path` was made with, but for those of its own input, overridden by the TOML file
-    and KEY=VALUE pairs. InputError for the first error, for a pair without effect, and where masks have to be given."""
-    if unused := next((key for key in read_pairs(pairs) if key.startswith(OF_MAP)), None):
+    and KEY=VALUE pairs. InputError for the first error, for one without effect, and where masks have to be given."""
+    settings = {} if file is None else {key: f"{file} {key}" for key, _ in flat(read_toml(file))}
+    settings |= {key: key for key in read_pairs(pairs)}
+    if unused := next((where for key, where in settings.items() if key.startswith(OF_MAP)), None):
         what = "has no effect on an update, which keeps the frame and the unit of its map"
         raise InputError(f"{unused}: {what}; leave it out (perception scale changes the unit of a map)")
     known = dict(fields(MapConfig))

@@ -76,7 +76,7 @@ def update_map(
         run = Run.begun(source, config, work, progress)
         masks = make_source(config.masks, config.sam)
         _refuse_other_masks(gmap, masks.name)
-        encoder = _encoder_of(gmap)
+        encoder = _encoder_of(gmap, config.language.encoder)
         visit = open_visit(run, gmap, masks, output)
         today = seen_today(visit)
         described = _described(visit, today, encoder)
@@ -95,16 +95,18 @@ def _refuse_other_masks(gmap: Map, name: str) -> None:
         raise InputError(f"--masks: {what}, and these cut things otherwise; give masks from {before}")
 
 
-def _encoder_of(gmap: Map) -> Encoder | None:
-    """The encoder that described the map's instances; None for a map without language."""
-    if not gmap.language:
-        return None
-    from perception.language.description import check_encoder
+def _encoder_of(gmap: Map, name: str) -> Encoder | None:
+    """The encoder that described the map's instances; None for a map without language. InputError where `name`, of the
+    settings, is another one."""
     from perception.language.encoders import make_encoder
 
-    encoder = make_encoder(str(gmap.setting("language", "encoder", "auto")))
-    assert encoder is not None
-    check_encoder(str(gmap.language["encoder"]), encoder.identity)
+    if not gmap.language and name == gmap.setting("language", "encoder", "auto"):
+        return None
+    encoder = make_encoder(name)
+    before, now = str(gmap.language.get("encoder", "none")), "none" if encoder is None else encoder.identity
+    if before != now:
+        todo = "leave it out" if "none" in (before, now) else "give the first, or run: perception upgrade MAP"
+        raise InputError(f"language.encoder: that of {gmap.path} is {before}, that of the visit {now}; {todo}")
     return encoder
 
 

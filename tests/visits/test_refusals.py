@@ -91,6 +91,30 @@ def test_a_setting_without_effect_is_refused(tmp_path: Path) -> None:
         with pytest.raises(InputError, match="no effect on an update"):
             update_settings(path, None, ["seed=1", pair])
     assert update_settings(path, None, ["seed=1"]).seed == 1
+    for text in ("[frame]\ntag_size = 0.1", '[splat]\nunit = "metre"', "photos.init_points = 'a.ply'"):
+        (tmp_path / "c.toml").write_text(f"seed = 2\n{text}\n")
+        with pytest.raises(InputError, match=r"c\.toml (frame|splat|photos)\.\w+: has no effect on an update"):
+            update_settings(path, tmp_path / "c.toml", [])
+    (tmp_path / "c.toml").write_text("seed = 2\n")
+    assert update_settings(path, tmp_path / "c.toml", []).seed == 2
+
+
+@pytest.mark.parametrize(("words", "given"), [(True, "none"), (True, "conse"), (False, "conse")])
+def test_another_encoder_than_that_of_the_map_is_refused(tmp_path: Path, words: bool, given: str) -> None:
+    """Else the new map would tell an encoder that did not make its embeddings."""
+    write_visited_map(tmp_path / "old.gsmap")
+    if not words:
+        gmap = read_map(tmp_path / "old.gsmap")
+        gmap.language = {}
+        write_map(tmp_path / "old.gsmap", gmap)
+    (tmp_path / "photos").mkdir()
+    photo(tmp_path / "photos/a.jpg", None)
+    config = update_settings(tmp_path / "old.gsmap", None, ["masks=builtin", f"language.encoder={given}"])
+    with pytest.raises(
+        InputError, match=r"language\.encoder: that of .* is (none|hash.*), that of the visit (none|conse)"
+    ):
+        update_map(tmp_path / "old.gsmap", tmp_path / "photos", tmp_path / "new.gsmap", config)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["old.gsmap", "photos"]
 
 
 def test_both_trainings_of_an_update_share_the_time_limit() -> None:
