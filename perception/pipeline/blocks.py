@@ -31,7 +31,7 @@ from perception.pipeline.checkpoint import BEFORE_MASKS, CHECKPOINT, digest, loa
 from perception.pipeline.estimate import largest_budget
 from perception.pipeline.optimise import Optimised, Photos, Run, label_by_tasks, label_photos, optimise
 from perception.progress import QUIET, Progress
-from perception.tasks.folder import has_task, read_task, write_task
+from perception.tasks.folder import has_task, read_facts, read_task, write_task
 from perception.types import Scene, View
 
 SAMPLE = 20_000
@@ -146,15 +146,16 @@ def optimise_blocks(
 ) -> Optimised:
     """Trains all blocks, joins their Gaussians, and labels all photos.
 
-    Each block is a task of the engine, in its own folder below `run.work`. A task that is finished is not run again.
-    A block makes masks of its own where they need depth; others are made once per photo.
+    Each block is a task of the engine, in its own folder below `run.work`. A task that is finished is not run again,
+    unless the masks or the time limit are others now. A block makes masks of its own where they need depth; others are
+    made once per photo.
     """
     label_by_tasks(run, training, source)
     held = {view.name for view in held_out}
     total = sum(len(block.views) for block in blocks)
     configs = [run.config.part(len(block.views) / total) for block in blocks]
     each = zip(blocks, configs, strict=True)
-    folders = [_task(run, scene, block, config, held, source.needs_depth) for block, config in each]
+    folders = [_task(run, scene, block, config, held, source) for block, config in each]
     with run.stage("train"):
         run.engine.run(optimise_block, [str(folder.resolve()) for folder in folders], "block", run.progress)
     parts, records, reports = [], [], []
@@ -204,32 +205,44 @@ def joined(parts: Sequence[Gaussians]) -> Gaussians:
     return Gaussians.concatenate(padded)
 
 
-def _task(run: Run, scene: Scene, block: Block, config: MapConfig, held: set[str], own_masks: bool) -> Path:
-    """Writes the task of a block: the part of the scene that it is trained on, and the settings. Returns its folder."""
+def _task(run: Run, scene: Scene, block: Block, config: MapConfig, held: set[str], source: MaskSource) -> Path:
+    """Writes the task of a block: the part of the scene that it is trained on, unless it is there, and the settings of
+    this run, in sizes of the first one. Returns its folder."""
     views = [scene.views[i] for i in block.views]
     names = [view.name for view in views]
     box = [block.low.tolist(), block.high.tolist()]
-    folder = run.work / f"block-{digest(run.mark, names, box)}"
-    if not has_task(folder):
+    folder, part = run.work / f"block-{digest(run.mark, names, box)}", None
+    if has_task(folder):
+        began = read_facts(folder)["config"]["train"]
+        sizes = {name: began[name] for name in ("iterations", "budget")}
+        config = config.model_copy(update={"train": config.train.model_copy(update=sizes)})
+    else:
+        config = sized(config, len(set(names) - held), largest_budget(memory_limit()))  # the driver's memory
         seen = np.zeros(len(scene.points), bool)
         for view in views:
             seen |= visible_points(view, scene.points)
-        write_task(
-            folder,
-            replace(scene, views=views, points=scene.points[seen], point_colors=scene.point_colors[seen]),
-            source=str(run.source.resolve()),
-            config=sized(config, len(set(names) - held), largest_budget(memory_limit())).to_json(),  # the driver's
-            held_out=sorted(held & set(names)),
-            box=box,
-            masks=str((folder / "masks" if own_masks else run.masks).resolve()),
-        )
+        part = replace(scene, views=views, points=scene.points[seen], point_colors=scene.point_colors[seen])
+    write_task(
+        folder,
+        part,
+        source=str(run.source.resolve()),
+        config=config.to_json(),
+        held_out=sorted(held & set(names)),
+        box=box,
+        masks=str((folder / "masks" if source.needs_depth else run.masks).resolve()),
+        trained_by={"masks": source.identity, "time_limit": config.train.time_limit},
+    )
     return folder
 
 
 def optimise_block(folder: str, progress: Progress = QUIET) -> None:
     """Trains the block whose task lies in `folder`, and writes RESULT there. Goes on from its checkpoint, if any."""
     work = Path(folder)
-    if load_checkpoint(work / RESULT, work.name) is not None:
+    by = read_facts(work)["trained_by"]
+    made = load_checkpoint(work / RESULT, work.name)
+    was = by if made is None else made.get("by", by)
+    can_go_on = (work / CHECKPOINT).exists() and was["time_limit"] != by["time_limit"]
+    if made is not None and was["masks"] == by["masks"] and not can_go_on:
         return
     scene, facts = read_task(work)
     config = MapConfig.model_validate(facts["config"])
@@ -243,6 +256,8 @@ def optimise_block(folder: str, progress: Progress = QUIET) -> None:
         optimised = optimise(run, scene, training, held_out, source, box)
         gaussians = optimised.nearby.gaussians.to("cpu")
         state = {name: tensor.contiguous() for name, tensor in gaussians.named().items()}
-        save_checkpoint(work / RESULT, {"gaussians": state, "record": asdict(optimised.record)}, work.name)
-        for name in (CHECKPOINT, BEFORE_MASKS):
-            (work / name).unlink(missing_ok=True)
+        result = {"gaussians": state, "record": asdict(optimised.record), "by": by}
+        save_checkpoint(work / RESULT, result, work.name)
+        if by["time_limit"] is None:  # else more time may be given
+            for name in (CHECKPOINT, BEFORE_MASKS):
+                (work / name).unlink(missing_ok=True)

@@ -253,7 +253,7 @@ def working(source: Path, output: Path, resume: bool) -> Iterator[Path]:
                 raise
             raise InputError(f"{work}: the disk is full; free some space and go on with --resume") from error
         except InputError:
-            if fresh and not any(work.rglob(CHECKPOINT)):  # also of a block
+            if fresh and not any(work.rglob("*.pt")):  # also of a block
                 _remove(work)
                 if not had_frames and (frames_folder(output) / FRAMES_RECORD).is_file():
                     shutil.rmtree(frames_folder(output), ignore_errors=True)

@@ -16,7 +16,8 @@ import torch
 
 from perception.config import MapConfig, load_config
 from perception.errors import InputError
-from perception.gaussians.model import from_points
+from perception.gaussians.model import Nearby, from_points
+from perception.gaussians.state import TrainingState, TrainRecord
 from perception.gaussians.stereo import visible_points
 from perception.geometry import camera_centres
 from perception.map.write import Map
@@ -24,9 +25,9 @@ from perception.masks import make_source
 from perception.pipeline import blocks as module
 from perception.pipeline import photo_tasks
 from perception.pipeline.blocks import APART, Block, cut, joined, nearby_rows, optimise_block, optimise_blocks
-from perception.pipeline.checkpoint import work_folder
+from perception.pipeline.checkpoint import CHECKPOINT, work_folder
 from perception.pipeline.mapping import build_map
-from perception.pipeline.optimise import Run
+from perception.pipeline.optimise import Optimised, Photos, Run
 from perception.progress import QUIET
 from perception.tasks.engine import Engine
 from perception.tasks.folder import TASK, read_task, versions, write_task
@@ -157,6 +158,53 @@ def test_blocks_share_the_time_limit(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert len({round(limit / photos, 6) for photos, limit in limits}) == 1
 
 
+def test_a_resumed_block_has_the_settings_of_today(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its time limit, device and masks; sizes and the part of the scene are those that it began with."""
+    scene, asked = corridor(), list[tuple[MapConfig, int]]()
+
+    def train(folder: str, progress: Any) -> None:
+        part, facts = read_task(Path(folder))
+        asked.append((MapConfig.model_validate(facts["config"]), len(part.points)))
+
+    monkeypatch.setattr(module, "optimise_block", train)
+    blocks = cut(scene, 15)
+    for more, pairs in enumerate((["train.time_limit=60"], ["train.time_limit=240", "device=cpu", "masks=builtin"])):
+        run = Run.begun(tmp_path, load_config(pairs=pairs), tmp_path, QUIET)
+        with pytest.raises(InputError, match=r"has no result\.pt"):  # nothing was trained
+            optimise_blocks(blocks, run, scene, scene.views, [], make_source("builtin"))
+        monkeypatch.setattr(module, "largest_budget", lambda memory, more=more: 100 + more)
+        scene = replace(scene, points=scene.points[:1000], point_colors=scene.point_colors[:1000])
+    first, again = asked[: len(blocks)], asked[len(blocks) :]
+    for (before, points), (now, others) in zip(first, again, strict=True):
+        assert now.train.time_limit == pytest.approx(4 * (before.train.time_limit or 0)) and points == others
+        assert (now.device, now.masks) == ("cpu", "builtin") and now.train.budget == before.train.budget > 101
+
+
+def test_a_finished_block_is_trained_again_only_for_other_masks_or_more_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trained, scene = list[int](), corridor(4)
+    labels = Scene(scene.views, scene.points[:9], scene.point_colors[:9])
+    gaussians = from_points(np.eye(3), np.zeros((3, 3), np.uint8), feature_dim=2, seed=0)
+
+    def optimised(run: Run, *rest: Any) -> Optimised:
+        trained.append(0)
+        (run.work / CHECKPOINT).touch()
+        return Optimised(Nearby(gaussians), Photos([], [], [], []), TrainRecord(), {})
+
+    def again(limit: float | None, masks: str) -> int:
+        config = MapConfig().model_copy(update={"masks": "builtin"})
+        facts = {"source": "x", "config": config.to_json(), "held_out": [], "box": [], "masks": "x"}
+        write_task(tmp_path / "b", labels, **facts, trained_by={"masks": masks, "time_limit": limit})
+        optimise_block(str(tmp_path / "b"))
+        return len(trained)
+
+    monkeypatch.setattr(module, "optimise", optimised)
+    assert [again(5.0, "a"), again(5.0, "a"), again(9.0, "a"), again(9.0, "b"), again(None, "b")] == [1, 1, 2, 3, 4]
+    assert not (tmp_path / "b" / CHECKPOINT).exists()  # all is done
+    assert [again(3.0, "b"), again(None, "b"), again(None, "c")] == [4, 4, 5]
+
+
 def test_joined_gaussians_keep_their_order_harmonics_and_blocks() -> None:
     a, b = (from_points(np.eye(3) * n, np.full((3, 3), 90, np.uint8), feature_dim=2, seed=0) for n in (1, 2))
     b = replace(b, sh=torch.arange(36.0).reshape(3, 4, 3))
@@ -211,6 +259,30 @@ def test_near_a_photo_are_the_gaussians_of_the_blocks_that_it_sees() -> None:
         assert np.concatenate(rows[view.name]).tolist() == [i for i, block in enumerate(owner) if sees[block]]
     assert len(blocks) > 2 and len({id(parts) for parts in rows.values()}) < len(scene.views)  # shared
     assert len({id(part) for parts in rows.values() for part in parts}) == len(blocks)  # a row is held once
+
+
+@pytest.mark.slow
+def test_blocks_go_on_for_the_time_that_is_added(row: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock that counts iterations, 100 a second: a finished block and one that was stopped, at half its time."""
+    monkeypatch.setattr(TrainingState, "elapsed", property(lambda self: self.iteration / 100))
+    out, trained, original = tmp_path / "m.gsmap", list[object](), module.optimise
+
+    def second(run: Run, *rest: Any) -> Any:
+        trained.append(run)
+        if len(trained) == 2:
+            monkeypatch.setattr("perception.pipeline.checkpoint.TrainingObserver.after_step", interrupt_at(20))
+        return original(run, *rest)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(module, "optimise", second)
+        build_map(row, out, settings(row, "train.time_limit=0.8"))
+    monkeypatch.undo()
+    monkeypatch.setattr(TrainingState, "elapsed", property(lambda self: self.iteration / 100))
+    blocks = build_map(row, out, settings(row, "train.time_limit=2"), resume=True).info["blocks"]
+    photos = sum(block["photos"] for block in blocks)
+    assert len(blocks) >= 2
+    for block in blocks:
+        assert block["iterations"] == pytest.approx(200 * block["photos"] / photos, abs=1.01)
 
 
 @pytest.mark.slow

@@ -184,3 +184,13 @@ def test_only_what_a_run_wrote_is_removed_from_its_folders(tmp_path: Path) -> No
         filled(frames_folder(output), "notes.txt")  # by somebody else meanwhile
         raise InputError("the frames cannot be written")
     assert (frames_folder(output) / "notes.txt").exists() and not work.exists()
+
+
+@pytest.mark.parametrize("name", ["checkpoint.pt", "block-1/checkpoint.pt", "block-1/result.pt"])
+def test_what_was_trained_is_kept_when_the_first_run_ends_with_an_error(tmp_path: Path, name: str) -> None:
+    """Such as that of the second block, where the first one is finished and has no checkpoint any more."""
+    source, output = filled(tmp_path / "in", "1.jpg"), tmp_path / "m.gsmap"
+    with pytest.raises(InputError), working(source, output, resume=False) as work:
+        filled(work, "inputs.json", name)
+        raise InputError("cuda: its memory is full")
+    assert (work / name).exists()
