@@ -165,7 +165,7 @@ def _relink(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
     facts = relink(args.map, args.folder)
     lines = [f"{args.map}: {facts['linked']} photos found in {args.folder}"]
-    lines += [f"warning: {name}: not found there" for name in facts["missing"]]
+    lines += [f"warning: {name}: not found there, or more than once" for name in facts["missing"]]
     lines += [f"warning: {name}: another size than the photo of the map; left out" for name in facts["differ"]]
     return facts, "\n".join(lines)
 

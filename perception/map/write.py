@@ -137,7 +137,8 @@ def relink(path: Path, folder: Path) -> dict[str, Any]:
     A photo is searched by the view name ("a/0001.jpg"), that among the photos of its visit, else by the file name alone
     if that is unique among files of its size below `folder`; capitals and small letters are the same.
     Views without such a photo keep their record. Returns {"linked": count, "missing": names, "differ": names of
-    photos of another size}. InputError when no photo is found, or while the map is locked by another writer.
+    photos of another size, which are no photos of other views}. InputError when no photo is found, or while the map is
+    locked by another writer.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: is no folder; give the one that holds the photos of {path}")
@@ -147,28 +148,28 @@ def relink(path: Path, folder: Path) -> dict[str, Any]:
     named = NamedFiles(folder)
     with writing(path):
         files = MapFiles(path)
-        entries, linked, missing, differ = [], 0, [], []
+        entries, linked, left = [], set[Path](), dict[str, list[Path]]()
         for entry, view in zip(files.facts.get("views", []), files.read("views"), strict=True):
             alike = [file for file in by_name[folded(PurePosixPath(view.name).name)] if file.is_file()]
             exact = [file for file in map(named.find, (view.name, view.photo_name)) if file is not None]
             of_size = [[f for f in some if view.photo_bytes in (None, f.stat().st_size)] for some in (exact, alike)]
-            if not any(of_size) and (exact or alike):
-                differ.append(view.name)
-            elif not of_size[0] and len(of_size[1]) != 1:
-                missing.append(view.name)
+            if not of_size[0] and len(of_size[1]) != 1:
+                left[view.name] = [] if of_size[1] else [*exact, *alike]
             else:
-                linked += 1
                 found = (of_size[0] or of_size[1])[0]
+                linked.add(found)
                 record = view_json(stored_view(view_from_json({**entry, "photo": str(found)}), path))
                 entry = {**entry, **{key: record[key] for key in ("photo", "photo_beside", "photo_bytes")}}
             entries.append(entry)
-        if linked == 0:
+        differ = [name for name, others in left.items() if not linked.issuperset(others)]
+        missing = [name for name, others in left.items() if linked.issuperset(others)]
+        if not linked:
             other = f", {len(differ)} have another size than the photos of the map" if differ else ""
             raise InputError(f"{folder}: holds none of the {len(entries)} photos of {path}{other}; give their folder")
         facts = {**files.facts, "views": entries}
         with atomic_file(path / FACTS) as aside:
             _dump(aside, seal(facts) if "files" in facts else facts)
-    return {"linked": linked, "missing": missing, "differ": differ}
+    return {"linked": len(entries) - len(left), "missing": missing, "differ": differ}
 
 
 def write_gaussian_ply(path: Path, gmap: Map) -> None:

@@ -137,6 +137,13 @@ def test_relink_finds_the_photos_of_all_visits_below_one_folder(path: Path) -> N
     (moved / "first").rename(moved / "again")
     shutil.copytree(moved / "again", moved / "twice")
     assert relink(path, moved) == {"linked": 2, "missing": ["s/00000.png"], "differ": []}
+    photo_of(moved / "visit2/images/00000.png", RED, 300)  # edited
+    for folder, linked in ((moved / "visit1/images", "visit1/00000.png"), (moved / "twice/s", "s/00000.png")):
+        others = [name for name in ("s/00000.png", "visit1/00000.png", "visit2/00000.png") if name != linked]
+        assert relink(path, folder) == {"linked": 1, "missing": others, "differ": []}
+    (moved / "visit2/images/00000.png").rename(moved / "visit2/00000.png")
+    (moved / "visit1").rename(moved / "visit2/visit1")
+    assert relink(path, moved / "visit2")["differ"] == ["s/00000.png", "visit2/00000.png"]
 
 
 def test_relink_refuses_a_folder_without_the_photos(path: Path) -> None:
