@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -69,10 +70,11 @@ def new_surface(looks: Sequence[Look], like: Gaussians, budget: int, seed: int) 
     return Gaussians.concatenate(parts).with_coefficients(like.sh.shape[1])
 
 
-def update_config(config: MapConfig, photos: int, share: float, start: int) -> MapConfig:
+def update_config(config: MapConfig, photos: int, share: float, start: int, alone: bool = False) -> MapConfig:
     """The settings of one leg of training: `share` of the iterations of a new map, fewer for a few photos, as these see
-    little; at most `start` Gaussians, and its part of a time limit."""
-    part, share = share / (GROWING + SETTLING), share * min(1.0, photos / USUAL_PHOTOS)
+    little; at most `start` Gaussians, and its part of a time limit, which is all where it is the only leg."""
+    part = 1.0 if alone else share / (GROWING + SETTLING)
+    share *= min(1.0, photos / USUAL_PHOTOS)
     iterations = max(LEAST_ITERATIONS, round(share * sized(config, photos).train.iterations))
     train = config.part(part).train.model_copy(update={"iterations": iterations, "budget": max(1, start)})
     return config.model_copy(update={"train": train})
@@ -89,9 +91,11 @@ def trained(
     rehearsed: Sequence[TrainingView],
     config: MapConfig,
 ) -> tuple[Gaussians, TrainRecord]:
-    """Trains one leg on the photos and on what is `rehearsed`, from its checkpoint on if there is one: all of the
-    Gaussians beyond the first `held` rows, and the colours of those. On the CPU."""
-    work = run.work / f"leg-{leg}"
+    """Trains one leg on the photos and on what is `rehearsed`: all of the Gaussians beyond the first `held` rows, and
+    the colours of those. From its checkpoint on, if there is one that began with these Gaussians: other settings of
+    instances, or more time for the leg before, give others. On the CPU."""
+    start = hashlib.sha256(b"".join(tensor.numpy().tobytes() for tensor in gaussians.named().values())).hexdigest()
+    work = run.work / f"leg-{leg}-{start[:16]}"
     work.mkdir(exist_ok=True)
     trainer = Trainer(gaussians, [*photos.views, *rehearsed], config, photos.held, run.device, held=held)
     trainer.stopping.degree_decided = True  # the map's

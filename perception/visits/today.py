@@ -334,7 +334,7 @@ def _settled(
         members.append(np.ones(len(names[-1]), np.float32) if back else gmap.membership[own])
         owned.append(np.full(len(names[-1]), -1, np.int32) if back else parts[own])
     together = Gaussians.concatenate(placed)
-    config = update_config(run.config, len(visit.photos.views), SETTLING, len(together))
+    config = update_config(run.config, len(visit.photos.views), SETTLING, len(together), alone=not record.iterations)
     start = together.sh.clone()
     new = together.rows(torch.from_numpy(np.flatnonzero(np.concatenate(came))))
     others = Gaussians.concatenate([visit.part(np.isin(visit.ids, gone)), new])

@@ -13,17 +13,19 @@ from PIL import Image
 
 from perception.config import MapConfig, load_config
 from perception.errors import InputError
-from perception.gaussians.model import isotropic
+from perception.gaussians.model import Gaussians, from_points, isotropic
 from perception.gaussians.views import TrainingView
 from perception.map.write import read_map, set_labels, write_map
 from perception.pipeline.changes import inputs_of
 from perception.pipeline.checkpoint import digest, fingerprint
+from perception.pipeline.optimise import Photos, Run
 from perception.visits.colours import without_colours
-from perception.visits.growth import GROWING, SETTLING, update_config
+from perception.visits.growth import GROWING, SETTLING, trained, update_config
 from perception.visits.look import Look
 from perception.visits.record import visit_record
 from perception.visits.scene import foreign_photos, refuse_older, update_settings
 from perception.visits.update import update_map
+from support.progress import Told
 from support.visited_map import number, write_visited_map
 
 TAKEN, OFFSET = 0x9003, 0x9011  # EXIF DateTimeOriginal and OffsetTimeOriginal
@@ -122,6 +124,26 @@ def test_both_trainings_of_an_update_share_the_time_limit() -> None:
     limits = [update_config(config, 20, share, 1000).train.time_limit or 0 for share in (GROWING, SETTLING)]
     assert sum(limits) == pytest.approx(60) and limits[0] / limits[1] == pytest.approx(GROWING / SETTLING)
     assert update_config(load_config(), 20, GROWING, 1000).train.time_limit is None
+    assert update_config(config, 20, SETTLING, 1000, alone=True).train.time_limit == 60  # nothing grows
+
+
+def test_a_leg_goes_on_only_from_the_gaussians_that_it_began_with(tmp_path: Path) -> None:
+    """Other settings of instances, or more time for growth, give others, of which each row is of some instance."""
+    rng = np.random.default_rng(0)
+    picture = torch.from_numpy(rng.integers(0, 255, (16, 24, 3)).astype(np.uint8))
+    K = torch.tensor([[20.0, 0, 12], [0, 20, 8], [0, 0, 1]])
+    view = TrainingView("a", picture, None, K, torch.eye(4))
+    config, told = load_config(pairs=["train.iterations=20", "train.budget=50", "train.exchange_db=0"]), Told()
+    run, photos = Run.begun(tmp_path, config, tmp_path, told), Photos([], [], [view], [])
+
+    def settled(count: int) -> Gaussians:
+        points = np.random.default_rng(1).uniform([-1, -1, 3], [1, 1, 5], (count, 3))
+        held = from_points(points, np.full((count, 3), 90, np.uint8), feature_dim=2, seed=0)
+        return trained(run, "settle", "mark", "masks", held, count, photos, [], config)[0]
+
+    first = settled(30)
+    assert len(settled(40)) == 40 and not told.lines  # with the checkpoint of 30
+    assert torch.equal(settled(30).sh, first.sh) and told.lines == ["resuming at iteration 20"]
 
 
 def test_a_finished_update_is_that_of_the_same_photos_and_the_same_map(tmp_path: Path) -> None:
