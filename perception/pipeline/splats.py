@@ -38,6 +38,7 @@ REFUSED = {
     "photos.ignore_masks": "--ignore-masks",
     "photos.init_points": "--init-points",
     "photos.held_out": "photos.held_out",
+    "train.time_limit": "--time-limit",
 }
 """Settings that a splat has no use for."""
 

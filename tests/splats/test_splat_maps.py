@@ -92,6 +92,7 @@ def test_settings_that_do_not_go_together(tmp_path: Path, capsys: pytest.Capture
     photos.mkdir()
     for arguments, words in (
         ([str(source), "--known-length", "0.3: a.jpg 1,2 3,4; b.jpg 1,2 3,4"], "--known-length: does not go with"),
+        ([str(source), "--time-limit", "60"], "--time-limit: does not go with"),
         ([str(source), "--up", "north"], "--up: found 'north'"),
         ([str(source), "--memory", "1G"], "need about 1.5 GiB, --memory is 1G"),
         ([str(source), "--cameras", str(tmp_path / "none")], "no such file"),
