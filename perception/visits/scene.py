@@ -40,10 +40,10 @@ LEAST_SHARE = 0.8
 """Share of the photos that must show the map; a few that do not are left out."""
 SAME = 0.02
 """Turn in radians and shift over the median depth, in sum, up to which two photos were taken from one place."""
-OF_INPUT = ("photos.camera", "photos.ignore_masks", "photos.init_points", "photos.held_out", "frame.", "device")
-"""Settings, or groups of them, that belong to the input of a map and not to those of its visits."""
 OF_MAP = ("photos.init_points", "frame.", "splat.")
-"""Those that an update does not use: it keeps the frame and the unit of its map."""
+"""Settings, or groups of them, that an update does not use: it keeps the frame and the unit of its map."""
+OF_INPUT = ("photos.camera", "photos.ignore_masks", "photos.held_out", "device", *OF_MAP)
+"""Those that belong to the input of a map and not to those of its visits."""
 OTHER_UNIT = 1.5
 """Factor between measured depths and the map's from which the visit is in another unit."""
 

@@ -101,6 +101,18 @@ def test_a_setting_without_effect_is_refused(tmp_path: Path) -> None:
     assert update_settings(path, tmp_path / "c.toml", []).seed == 2
 
 
+def test_a_visit_has_no_files_of_the_maps_own_input(tmp_path: Path) -> None:
+    """They may be gone; those of masks and words are asked for again."""
+    gmap, path = read_map(write_visited_map(tmp_path / "a.gsmap")), tmp_path / "a.gsmap"
+    names = ("photos.camera", "photos.ignore_masks", "photos.init_points", "photos.held_out", "splat.cameras")
+    gmap.info["config"] = load_config(pairs=[f"{name}={tmp_path / 'gone'}" for name in names]).to_json()
+    write_map(path, gmap)
+    (tmp_path / "photos").mkdir()
+    photo(tmp_path / "photos/a.jpg", None)
+    found = inputs_of(tmp_path / "photos", update_settings(path, None, []), tmp_path / "new.gsmap")
+    assert [list(files) for files in found.values()] == [["a.jpg"]]
+
+
 @pytest.mark.parametrize(("words", "given"), [(True, "none"), (True, "conse"), (False, "conse")])
 def test_another_encoder_than_that_of_the_map_is_refused(tmp_path: Path, words: bool, given: str) -> None:
     """Else the new map would tell an encoder that did not make its embeddings."""
