@@ -57,12 +57,17 @@ def _join(ray: Any, address: str | None) -> None:
 
 @dataclass(frozen=True)
 class Engine:
-    """kind: "local" or "ray". address: of a running Ray cluster ("auto": this machine's); None starts one here.
+    """kind: "local" or "ray". address: of a running Ray cluster ("auto": this machine's); None starts one here;
+    InputError for one with "local".
     Tasks get and leave their data in folders that every worker reaches under the same path. The results do not depend
     on the kind and on the number of workers."""
 
     kind: str = "local"
     address: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind == "local" and self.address is not None:
+            raise InputError(f"--address {self.address}: is of a Ray cluster; give --engine ray too, or leave it out")
 
     def run(
         self, task: Callable[..., Any], items: Sequence[str], what: str, progress: Progress, each_core: bool = False

@@ -193,3 +193,13 @@ def test_paths_in_settings_are_relative_to_the_list(tmp_path: Path, monkeypatch:
         assert [Path(str(text).rpartition(":")[2]).resolve() for text in found] == [
             tmp_path / "lists" / name for name in ("labels", "model", "camera.yaml")
         ]
+
+
+def test_an_address_without_ray_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Else the maps are made here, while a cluster is paid for."""
+    (tmp_path / "photos").mkdir()
+    jobs = written(tmp_path, [{"input": "photos", "output": "a.gsmap"}])
+    for words in (["fleet", str(jobs)], ["map", str(tmp_path / "photos"), "-o", str(tmp_path / "a.gsmap")]):
+        assert main([*words, "--address", "host:6379"]) == 2
+        assert "--address host:6379: is of a Ray cluster; give --engine ray too" in capsys.readouterr().err
+    assert not list(tmp_path.glob("a.gsmap*"))
