@@ -121,10 +121,11 @@ def joined_instances(votes: MaskVotes, ids: np.ndarray, rows: np.ndarray) -> np.
 
 
 def grouped(gaussians: Gaussians, votes: MaskVotes, rows: np.ndarray, config: MapConfig) -> Grouping:
-    """Instances of the Gaussians `rows`, from where they lie and the masks: their features were trained too shortly to
-    tell things apart, and join a speaker with a chair that stands a metre beside it."""
+    """Instances of the Gaussians `rows`, from where they lie and the masks, whatever `instances.method` made the map:
+    their features were trained too shortly to tell things apart, and join a speaker with a chair a metre beside it."""
     part = gaussians.rows(torch.from_numpy(rows))
     own = MaskVotes(votes.pixels[rows], votes.void[rows], votes.view, votes.area, votes.label)
     means, scales, opacities = (tensor.numpy() for tensor in (part.means, part.scales, part.opacities))
     none = np.zeros((len(rows), 1), np.float32)
-    return group(means, scales, opacities, none, own, config.instances, seed=config.seed, whole=False)
+    options = config.instances.model_copy(update={"method": "consensus"})
+    return group(means, scales, opacities, none, own, options, seed=config.seed, whole=False)

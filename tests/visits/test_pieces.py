@@ -8,9 +8,13 @@ from typing import cast
 import numpy as np
 import pytest
 import torch
+from scipy.sparse import csr_matrix
 
+from perception.config import load_config
 from perception.gaussians.model import Gaussians, isotropic
 from perception.gaussians.views import TrainingView, render
+from perception.masks.votes import MaskVotes
+from perception.visits.growth import grouped
 from perception.visits.look import Look, look
 from perception.visits.today import _pieces
 from perception.visits.visit import Visit
@@ -62,3 +66,15 @@ def test_a_box_beside_the_chair_that_the_photos_show_is_none(paired: bool) -> No
     things = [(np.arange(400), 0.9), (np.arange(400, 800), 0.9)]
     whole = {0: CHAIR} | ({1: BOX} if paired else {})
     assert _pieces(visit_of(grown), grown, things, whole) == set()
+
+
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_two_new_things_are_two_whatever_method_made_the_map(preset: str) -> None:
+    """A metre apart, each in a mask of its own in all photos; features say nothing of them yet."""
+    things = Gaussians.concatenate([CHAIR, block((1, 0, 0), (1.2, 0.2, 0.3), 3)])
+    pixels = np.zeros((800, 12), np.float32)
+    pixels[:400, ::2] = pixels[400:, 1::2] = 9
+    masks = np.repeat(np.arange(6), 2), pixels.sum(axis=0, dtype=np.float64)
+    votes = MaskVotes(csr_matrix(pixels), csr_matrix((800, 6), dtype=np.float32), *masks)
+    found = grouped(things, votes, np.arange(800), load_config(preset=preset))
+    assert found.count == 2 and [np.unique(half).size for half in np.split(found.ids, 2)] == [1, 1]
