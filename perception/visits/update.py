@@ -12,6 +12,7 @@ record     states, confidences and past places of all instances                 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -26,8 +27,10 @@ from perception.language.base import Encoder
 from perception.language.ocr import make_reader
 from perception.machine import peak_memory_mib
 from perception.map.history import is_removed
+from perception.map.map import MAX_SIDE
 from perception.map.write import Map, read_map, write_map
 from perception.masks import make_source
+from perception.photos.decode import scaled_size
 from perception.photos.view_json import StoredView, moved_record, stored_view
 from perception.pipeline.changes import finished, hold_inputs
 from perception.pipeline.checkpoint import check_name, digest, fingerprint, working
@@ -35,6 +38,7 @@ from perception.pipeline.instances import DescribedInstances, describe
 from perception.pipeline.optimise import Optimised, Run
 from perception.pipeline.record import finite, score_views
 from perception.progress import QUIET, Progress
+from perception.types import View
 from perception.visits.colours import in_grey
 from perception.visits.record import (
     joined_language,
@@ -164,7 +168,10 @@ def assembled(visit: Visit, today: Today, described: DescribedInstances, output:
     views = [*(moved_record(view, gmap.path, output) for view in old), *_views(visit, output, prefix)]
     info = {**gmap.info, "visits": visits_with(gmap, run.source, [v.photo for v in views if v.visit == number])}
     seconds = {**run.seconds, "total": time.monotonic() - run.started}
-    info |= {"quality": quality, "config": run.config.to_json(), "fingerprint": mark, "seconds": seconds}
+    config, side = run.config.to_json(), gmap.setting("photos", "max_side", MAX_SIDE)
+    language = renamed(described.language, prefix, visit.photos.training, run.config.photos.max_side, side)
+    config["photos"]["max_side"] = side  # at which boxes of all views are
+    info |= {"quality": quality, "config": config, "fingerprint": mark, "seconds": seconds}
     info["instances"] = {**info.get("instances", {}), "count": len(instances)}
     info["next_id"] = max([gmap.next_id, *(i + 1 for i in today.added)])
     info |= {"training": asdict(today.record), "masks": visit.masks, "peak_memory_mib": peak_memory_mib()}
@@ -177,7 +184,7 @@ def assembled(visit: Visit, today: Today, described: DescribedInstances, output:
         instances=finite(instances),
         info=finite(info),
         views=views,
-        language=joined_language(gmap.language, _renamed(described.language, prefix)),
+        language=joined_language(gmap.language, language),
         parts=kept_parts(gmap.parts, today.part_ids, instances),
         groups=groups,
         past=past_with(gmap, today.gone, number - 1, visit.light),
@@ -205,11 +212,18 @@ def _views(visit: Visit, output: Path, prefix: str) -> list[Any]:
     return made
 
 
-def _renamed(language: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+def renamed(
+    language: dict[str, np.ndarray], prefix: str, views: Sequence[View], visit_side: int, side: int
+) -> dict[str, np.ndarray]:
+    """language.npz of the visit's `views` at `visit_side` pixels, with the map's names of them, and boxes at `side`."""
     if not language:
         return {}
-    names = np.array([prefix + str(name) for name in language["view_names"]], dtype=np.str_)
-    return {**language, "view_names": names}
+    sizes = {v.name: np.divide(scaled_size(v, side), scaled_size(v, visit_side)) for v in views}
+    names, boxes = [str(name) for name in language["view_names"]], language["view_boxes"]
+    factors = np.array([sizes[name] for name in names]).reshape(len(names), 2)
+    low, high = np.floor(boxes[:, :2] * factors), np.ceil(boxes[:, 2:] * factors - 1e-9)
+    boxes = np.concatenate([low, high], axis=1).astype(boxes.dtype)
+    return {**language, "view_names": np.array([prefix + name for name in names], dtype=np.str_), "view_boxes": boxes}
 
 
 def _log_result(gmap: Map, output: Path, progress: Progress) -> None:

@@ -19,12 +19,13 @@ from perception.map.write import read_map, set_labels, write_map
 from perception.pipeline.changes import inputs_of
 from perception.pipeline.checkpoint import digest, fingerprint
 from perception.pipeline.optimise import Photos, Run
+from perception.types import View
 from perception.visits.colours import without_colours
 from perception.visits.growth import GROWING, SETTLING, trained, update_config
 from perception.visits.look import Look
 from perception.visits.record import visit_record
 from perception.visits.scene import foreign_photos, refuse_older, update_settings
-from perception.visits.update import update_map
+from perception.visits.update import renamed, update_map
 from support.progress import Told
 from support.visited_map import number, write_visited_map
 
@@ -184,3 +185,16 @@ def test_photos_or_maps_without_colours_are_known() -> None:
     maps = [isotropic(zeros, torch.zeros(3), rgb / 255, 0.9, 4, generator) for rgb in (colours, grey)]
     views: list[Any] = [[SimpleNamespace(photo=rgb[None])] for rgb in (colours, grey)]
     assert [[without_colours(one, photos) for photos in views] for one in maps] == [[False, True], [True, True]]
+
+
+def test_boxes_of_a_visit_of_another_size_are_at_the_size_of_the_map() -> None:
+    """A square of a picture of 400 × 300, found at 200 × 150, in a map at 800: at 400 × 300, as no photo grows."""
+    view, small = (
+        View(name, Path(name), np.eye(3), w, h, np.eye(4)) for name, w, h in (("a", 400, 300), ("b", 90, 60))
+    )
+    boxes = np.array([[10, 20, 200, 150], [1, 2, 90, 60]], np.int32)
+    found = renamed({"view_names": np.array(["a", "b"]), "view_boxes": boxes}, "visit1/", [small, view], 200, 800)
+    assert found["view_boxes"].tolist() == [[20, 40, 400, 300], [1, 2, 90, 60]]
+    assert found["view_boxes"].dtype == np.int32 and found["view_names"].tolist() == ["visit1/a", "visit1/b"]
+    back = renamed({"view_names": np.array(["a"]), "view_boxes": found["view_boxes"][:1] + 1}, "", [view], 800, 200)
+    assert back["view_boxes"].tolist() == [[10, 20, 201, 151]]  # all of it

@@ -175,9 +175,12 @@ def test_an_update_keeps_what_earlier_visits_saw(world: Path, monkeypatch: pytes
 
 def test_a_visit_without_changes_adds_nothing(world: Path) -> None:
     first = world / "visit0"
-    config = update_settings(world / "old.gsmap", None, [f"masks=labels:{first / 'labels'}"])
-    gmap = update_map(world / "old.gsmap", first, world / "same.gsmap", config)
+    pairs = [f"masks=labels:{first / 'labels'}", "photos.max_side=190"]
+    gmap = update_map(
+        world / "old.gsmap", first, world / "same.gsmap", update_settings(world / "old.gsmap", None, pairs)
+    )
     assert {entry["state"] for entry in gmap.instances} <= {"unchanged", "unseen"}
+    assert gmap.setting("photos", "max_side", 0) == 800  # at which the boxes of the first visit are
 
 
 def test_what_was_removed_and_comes_back_has_its_id_again(world: Path, new: Map) -> None:
