@@ -51,8 +51,8 @@ def scale_map(path: Path, output: Path | None, options: FrameConfig, improve: bo
 
 
 def scaled(gmap: Map, factor: float) -> Map:
-    """The map with all lengths times `factor`: Gaussians, instances with their history, parts, views, errors of depth.
-    map.json's map_from_input is continued if the input had poses."""
+    """The map with all lengths times `factor`: Gaussians, instances with their history, parts, views, errors of depth,
+    boxes of blocks. map.json's map_from_input is continued if the input had poses."""
     b_from_a = np.diag([factor, factor, factor, 1.0])
     info = dict(gmap.info)
     if "map_from_input" in info or info.get("scene", {}).get("input") != "photos":
@@ -60,6 +60,9 @@ def scaled(gmap: Map, factor: float) -> Map:
     if (depth := info.get("quality", {}).get("depth") or {}).get("unit") == "m":
         lengths = {name: factor * depth[name] for name in ("median", "tolerance")}
         info["quality"] = {**info["quality"], "depth": {**depth, **lengths}}
+    if "blocks" in info:  # their boxes are infinite at the outside
+        corners = [[[x and factor * x for x in corner] for corner in block["box"]] for block in info["blocks"]]
+        info["blocks"] = [{**block, "box": box} for block, box in zip(info["blocks"], corners, strict=True)]
 
     def entry(old: dict[str, Any]) -> dict[str, Any]:
         new = {**old, "centroid": (factor * np.array(old["centroid"])).tolist()}

@@ -61,7 +61,9 @@ def test_a_scaled_map_shows_the_same_pictures() -> None:
     part, whole = moved.instances[0]["parts"][0], gmap.instances[0]["parts"][0]
     np.testing.assert_allclose(part["aabb"]["min"], 3 * np.array(whole["aabb"]["min"]))
     assert "map_from_input" not in moved.info  # of photos without poses
-    given = scaled(Map.of(gmap, info={"scene": {"input": "colmap"}}), 3.0)
+    blocks = [{"photos": 4, "box": [[None, 0.0, None], [0.5, None, -2.0]]}]
+    given = scaled(Map.of(gmap, info={"scene": {"input": "colmap"}, "blocks": blocks}), 3.0)
+    assert given.info["blocks"] == [{"photos": 4, "box": [[None, 0.0, None], [1.5, None, -6.0]]}]
     np.testing.assert_allclose(map_from_input(Path("x"), given.info), np.diag([3, 3, 3, 1.0]))
 
 
