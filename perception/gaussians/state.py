@@ -59,11 +59,12 @@ class TrainRecord:
     skipped_gradients: int = 0
 
     @staticmethod
-    def joined(records: Sequence[TrainRecord]) -> TrainRecord:
-        """The record of a model that was trained in blocks: sums, and the decisions of each; it has no curve."""
+    def joined(records: Sequence[TrainRecord], what: str = "block") -> TrainRecord:
+        """The record of a model that was trained in blocks, or legs: sums, and the decisions of each; it has no curve.
+        what: one of them."""
         total = TrainRecord()
         for number, record in enumerate(records, start=1):
-            total.decisions += [f"block {number}: {decision}" for decision in record.decisions]
+            total.decisions += [f"{what} {number}: {decision}" for decision in record.decisions]
             total.profile = {part: total.profile.get(part, 0.0) + s for part, s in record.profile.items()}
             for name in ("pairs", "seconds", "iterations", "skipped_gradients"):
                 setattr(total, name, getattr(total, name) + getattr(record, name))

@@ -352,5 +352,5 @@ def _settled(
     names, members, owned = [gmap.instance_ids[rest], *names], [gmap.membership[rest], *members], [parts[rest], *owned]
     arrays = (np.concatenate(names).astype(np.int32), np.concatenate(members), np.concatenate(owned).astype(np.int32))
     motions = {i: motion for i, (_, motion) in pairs.items()}
-    record = TrainRecord.joined([record, last])
+    record = TrainRecord.joined([record, last], "leg")
     return Today(together, np.concatenate([rest, kept]), *arrays, signs, gone, motions, added, record)

@@ -116,6 +116,7 @@ def test_what_is_new_has_an_id_that_nothing_had(world: Path, new: Map) -> None:
 def test_scores_are_of_the_visits_own_photos_and_seconds_have_a_total(new: Map) -> None:
     held = {view.name for view in new.views if view.held_out and view.visit == 1}
     assert held and set(new.info["quality"]["views"]) == held
+    assert {text[:6] for text in new.info["training"]["decisions"]} == {"leg 1:", "leg 2:"}
     seconds = dict(new.info["seconds"])
     assert seconds.pop("total") >= sum(seconds.values()) > 0
 
