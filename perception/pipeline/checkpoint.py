@@ -99,10 +99,11 @@ class TrainingObserver:
                 continue
             if state["masks"] == self.masks or (state["masks"] is None and state["masks_enter"] <= self.masks_enter):
                 trainer.load(state["trainer"])
+                self.entered = state["masks"] is not None  # also where more time takes progress back before that
                 self.progress.log(f"resuming at iteration {trainer.iteration}")
                 break
             self.progress.log(f"{self.work / name}: was trained on other masks, which enter again")
-        self.entered = trainer.progress >= self.masks_enter
+        self.entered = self.entered or trainer.progress >= self.masks_enter
 
     def after_step(self, trainer: Trainer, loss: float) -> None:
         now = time.monotonic()

@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -120,6 +121,21 @@ def test_other_masks_repeat_the_training_from_where_they_enter(at: int, small_sc
     assert resumed == [min(at, 18)]
     whole = build_map(source, tmp_path / "whole.gsmap", config)
     assert np.array_equal(made.means, whole.means) and np.array_equal(made.features, whole.features)
+
+
+def test_more_time_does_not_make_a_state_independent_of_its_masks(tmp_path: Path) -> None:
+    """With ten times the time limit its progress of .4 is .04, which is before masks enter."""
+    trainer: Any = SimpleNamespace(load=lambda state: None, iteration=40, progress=0.04, state=lambda copy: {})
+    save_checkpoint(tmp_path / CHECKPOINT, {"masks": "a", "masks_enter": 0.3, "trainer": {}}, "mark")
+    told = Told()
+    for masks in ("a", "b"):  # the run is stopped at once, and goes on with other masks
+        observer = checkpoint.TrainingObserver(tmp_path, "mark", masks, 0.3, told)
+        observer.take_up(trainer)
+        observer.after_leg(trainer)
+    assert told.lines == [
+        "resuming at iteration 40",
+        f"{tmp_path / CHECKPOINT}: was trained on other masks, which enter again",
+    ]
 
 
 def test_other_settings_of_the_training_are_refused(small_scene: Path, tmp_path: Path) -> None:
