@@ -28,7 +28,10 @@ from perception.sfm.triangulate import posed_scene
 from perception.types import DepthImage, Lens, Scene, View
 
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
-_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV", "PERSPECTIVE")
+_RATIONAL = "FULL_OPENCV"
+_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", _RATIONAL, "PERSPECTIVE")
+_LISTED = ("k1", "k2", "k3", "k4", "p1", "p2")
+"""The order of nerfstudio's `distortion_params`."""
 MILLIMETRE = 1e-3
 """Unit of depth images without `depth_unit_scale_factor` or `integer_depth_scale`, in metres: nerfstudio's default."""
 _TRAIN, _PART = "transforms_train.json", re.compile(r"transforms_(train|test|val\w*|eval)\.json$")
@@ -142,7 +145,8 @@ def lens_values(lens: Lens) -> dict[str, Any]:
     """The keys of a lens in transforms.json, as this file reads them. InputError for a model that has none there."""
     names = {"f": ("fl_x", "fl_y"), "fx": ("fl_x",), "fy": ("fl_y",), "k": ("k1",)}
     fisheye = "FISHEYE" in lens.model
-    values: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV"}
+    model = "OPENCV_FISHEYE" if fisheye else _RATIONAL if lens.model == _RATIONAL else "OPENCV"
+    values: dict[str, Any] = {"camera_model": model}
     for name, value in zip(camera_from_lens(lens).params_info.split(", "), lens.params, strict=True):
         values.update(dict.fromkeys(names.get(name, (name,)), value))
     if values.keys() - {"camera_model", "fl_x", "fl_y", "cx", "cy", *(FISHEYE if fisheye else PERSPECTIVE)}:
@@ -311,9 +315,25 @@ def _lens(file: Path, values: dict[str, Any], photo: Path | None) -> Lens:
     fisheye = bool(values.get("is_fisheye")) or model in _FISHEYE
     if not fisheye and model not in _PERSPECTIVE:
         raise InputError(f"{what}: camera_model '{model}' is not supported; expected one of {_PERSPECTIVE + _FISHEYE}")
-    k = [_number(values, key, what) or 0.0 for key in (FISHEYE if fisheye else PERSPECTIVE)]
-    k = [] if "PINHOLE" in model and not fisheye else k
+    k = _distortion(values, what, model, FISHEYE if fisheye else () if "PINHOLE" in model else PERSPECTIVE)
     return opencv_lens((fx, fy, *center), k, int(width), int(height), fisheye)
+
+
+def _distortion(values: dict[str, Any], what: str, model: str, names: Sequence[str]) -> list[float]:
+    """The coefficients of such names, those of PERSPECTIVE, FISHEYE or none. InputError for others that are not 0, and
+    for k4 of a perspective camera without k5 and k6: to nerfstudio that is the factor of r⁸, which OpenCV has not."""
+    if (listed := values.get("distortion_params")) is not None:
+        if not isinstance(listed, list) or len(listed) != len(_LISTED):
+            raise InputError(f"{what}: distortion_params must be {' '.join(_LISTED)}, found {brief(listed)}")
+        values = {**values, **dict(zip(_LISTED, listed, strict=True))}
+    k = {name: _number(values, name, what) or 0.0 for name in PERSPECTIVE}
+    if other := [f"{name} = {value:g}" for name, value in k.items() if value and name not in names]:
+        expected = f"its camera_model has {', '.join(names) or 'no distortion'}"
+        raise InputError(f"{what}: {expected}, found {', '.join(other)}; correct camera_model, or undistort the photos")
+    if k["k4"] and names == PERSPECTIVE and model != _RATIONAL and not values.keys() & {"k5", "k6"}:
+        found = f"k4 = {k['k4']:g} is nerfstudio's factor of r⁸, which is not supported"
+        raise InputError(f"{what}: {found}; undistort the photos, or write camera_model {_RATIONAL} if it is OpenCV's")
+    return [k[name] for name in names]
 
 
 def _focals(values: dict[str, Any], what: str, width: float, height: float) -> tuple[float, float]:

@@ -4,6 +4,7 @@ import errno
 import json
 import threading
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -85,12 +86,33 @@ def test_transforms_angle_gives_the_focal_length(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("changes", "k"),
+    [
+        ({"distortion_params": [0.1, -0.05, 0.02, 0, 0.003, -0.004]}, (0.1, -0.05, 0.003, -0.004, 0.02)),
+        ({"camera_model": "full_opencv", "k1": 0.1, "k4": 0.2}, (0.1, 0, 0, 0, 0, 0.2, 0, 0)),
+        ({"k1": 0.1, "k4": 0.2, "k5": 0.0}, (0.1, 0, 0, 0, 0, 0.2, 0, 0)),
+    ],
+)
+def test_distortion_of_transforms_against_opencv(changes, k, tmp_path):
+    file, data = write_transforms(tmp_path, **changes)
+    rays = np.array([[0.0, 0, 1], [0.3, -0.2, 1], [-0.4, 0.35, 1]])
+    K = np.array([[data["fl_x"], 0, data["cx"]], [0, data["fl_y"], data["cy"]], [0, 0, 1]])
+    expected = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, np.array(k, np.float64))[0][:, 0]
+    found = camera_from_lens(read_frames(file)[0][2]).img_from_cam(rays)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(
     ("changes", "words"),
     [
         ({"w": 61}, "60×40"),
         ({"frames": []}, "empty"),
         ({"fl_x": "a"}, "fl_x"),
         ({"camera_model": "ODD"}, "ODD"),
+        ({"camera_model": "OPENCV", "k1": 0.1, "k4": 0.02}, "k4 = 0.02.*r⁸"),
+        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.02}, "p1 = 0.02"),
+        ({"camera_model": "PINHOLE", "k1": 0.1}, "k1 = 0.1"),
+        ({"distortion_params": [0.1, 0.02]}, r"found \[0.1, 0.02\]"),
     ],
 )
 def test_bad_transforms_are_one_clear_line(tmp_path, changes, words):
@@ -208,8 +230,6 @@ distortion_coefficients: {rows: 1, cols: 5, data: [0.06, -0.05, 0.001, -0.002, 0
 
 
 def test_camera_file_against_opencv(tmp_path):
-    import cv2
-
     (tmp_path / "camera.yaml").write_text(CAMERA)
     lens = read_camera(tmp_path / "camera.yaml")
     assert lens == DISTORTED
