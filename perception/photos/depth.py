@@ -23,7 +23,7 @@ _EDGE = 0.05
 
 def read_depth(path: Path) -> np.ndarray:
     """The image [h, w] as stored, float32, 0 = nothing `measured`.
-    InputError when the file is missing, damaged, empty or not of one channel."""
+    InputError when the file is missing, damaged, empty, not of one channel, or of 8 bits: a picture of depth."""
     if not path.is_file():
         raise InputError(f"{path}: no such depth image")
     what = "depth image; expected PNG or TIFF of one channel, or .npy"
@@ -31,6 +31,8 @@ def read_depth(path: Path) -> np.ndarray:
         image = map_npy(path) if path.suffix.lower() == ".npy" else read_picture(path, path, what)
     if image.ndim != 2 or image.size == 0 or image.dtype.kind not in "uif":
         raise InputError(f"{path}: found {image.dtype} {list(image.shape)}, expected a depth image of one channel")
+    if image.dtype.itemsize == 1:
+        raise InputError(f"{path}: holds 8 bits a pixel, a picture of depth; expected 16 bits or floating point")
     return measured(image)
 
 

@@ -83,6 +83,7 @@ def test_pixels_without_depth_stay_without(tmp_path):
         (lambda p: None, "no such depth image"),
         (lambda p: p.write_bytes(b"no image"), "not a readable depth image"),
         (lambda p: cv2.imwrite(str(p), np.zeros((4, 4, 3), np.uint8)), "one channel"),
+        (lambda p: cv2.imwrite(str(p), np.ones((48, 64), np.uint8)), "8 bits"),
         (lambda p: cv2.imwrite(str(p), np.ones((48, 48), np.uint16)), "field of view"),
     ],
 )
