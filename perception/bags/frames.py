@@ -33,14 +33,16 @@ class FrameOptions:
     """topic: of the images (None: the only one in the bag). camera_info: its topic (None: the one next to the images).
 
     camera: file that replaces camera_info. fixed_frame: the world frame (None: map, odom, world, or the root of the
-    tree). depth: topic, or "none" (None: the one registered to the images, else the only one). max_frames, spacing: see
-    Chooser. strict: a message that cannot be used is an InputError; otherwise it is left out, counted and named.
+    tree). odometry: topic whose poses are taken before all others. depth: topic, or "none" (None: the one registered to
+    the images, else the only one). max_frames, spacing: see Chooser. strict: a message that cannot be used is an
+    InputError; otherwise it is left out, counted and named.
     """
 
     topic: str | None = None
     camera_info: str | None = None
     camera: Path | None = None
     fixed_frame: str | None = None
+    odometry: str | None = None
     depth: str | None = None
     max_frames: int = 200
     spacing: float = 0.08
@@ -71,7 +73,7 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
         if not numbers:
             raise InputError("; ".join([f"{source}: {topic} holds no images", *bag.lines()]))
         chosen = {numbers[index] for index in chooser.chosen(options.max_frames)}
-        poses = read_poses(bag)
+        poses = read_poses(bag, options.odometry)
         with atomic_directory(output, fresh=True) as aside:
             if options.camera is None:
                 write_camera(aside / "camera.yaml", info)
@@ -79,16 +81,22 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
                 shutil.copyfile(options.camera, aside / "camera.yaml")
             stamps, frame = _write_images(bag, topic, decode, chosen, aside / "images")
             depth, source_of_depth = dict[str, str](), None
+            measured = choose_depth(bag, [t for t in depths if t != topic], options.depth, frame)
             try:
-                measured = choose_depth(bag, [t for t in depths if t != topic], options.depth, frame)
                 if measured is not None:
                     depth, source_of_depth = write_depth(bag, measured, stamps, lens, frame, poses, aside / "depth")
+                    if options.depth is None and (others := [t for t in depths if t not in (topic, measured)]):
+                        source_of_depth += f"; --depth TOPIC takes {' or '.join(others)}"
             except InputError as error:  # depth that no option names and that cannot be used is left out
                 if options.depth is not None or options.strict:
                     raise
                 bag.left_out.pop(str(measured), None)
                 shutil.rmtree(aside / "depth", ignore_errors=True)
                 source_of_depth = f"left out: {error}"
+            above = poses.path(frame)
+            if options.odometry is not None and not any(options.odometry in poses.topics.get(f, ()) for f in above):
+                found = f"it has no pose of '{frame}' or a frame above it ({', '.join(above[1:]) or 'none'})"
+                raise InputError(f"{bag.path}: --odometry {options.odometry}: {found}")
             known, fixed = _camera_poses(poses, stamps, frame, options.fixed_frame)
             why = None if fixed is not None else _why_no_pose(poses, frame, options.fixed_frame)
             if why is not None and options.fixed_frame is not None:
@@ -107,6 +115,7 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
         "chosen": len(stamps),
         "with_pose": len(known),
         "fixed_frame": fixed,
+        "poses_from": poses.told(frame),
         "why_no_pose": why,
         "camera_frame": frame,
         "size": [lens.width, lens.height],
@@ -196,6 +205,8 @@ def _text(facts: dict[str, Any]) -> str:
     line = f"{folder}: {facts['chosen']} of {facts['images']} images of {facts['topic']}, {facts['camera_model']}"
     if facts["with_pose"]:
         line += f"; {facts['with_pose']} with a pose in '{facts['fixed_frame']}'"
+    if facts["poses_from"]:
+        line += f"\nposes: {facts['poses_from']} (--odometry TOPIC takes another)"
     if facts["left_out"]:
         line += "\n" + "\n".join(facts["left_out"])
     if facts["depth"]:

@@ -26,12 +26,14 @@ BASES, CONVENTION_DEG = ("base_link", "base_footprint"), 2.0
 
 
 class Poses:
-    """A tree of frames over time: parent_from_child samples of every child frame."""
+    """A tree of frames over time: parent_from_child samples of every child frame. topics: of each child frame, those
+    with its poses, of which the first is taken."""
 
     def __init__(self) -> None:
         self.parents = dict[str, str]()
         self._samples = dict[str, list[tuple[int, np.ndarray]]]()
         self._static = set[str]()
+        self.topics = dict[str, list[str]]()
         self._arrays = dict[str, tuple[np.ndarray, np.ndarray]]()
 
     def add(self, parent: str, child: str, time: int, parent_from_child: np.ndarray, static: bool = False) -> None:
@@ -49,6 +51,12 @@ class Poses:
         while (parent := self.parents.get(found[-1])) is not None and parent not in found:
             found.append(parent)
         return found
+
+    def told(self, frame: str) -> str | None:
+        """Of which topics the poses above `frame` are, where there are several; None where there are not."""
+        several = {child: found for child in self.path(frame) if len(found := self.topics.get(child, [])) > 1}
+        lines = [f"'{child}' by {found[0]}, not {', '.join(found[1:])}" for child, found in several.items()]
+        return "; ".join(lines) or None
 
     def camera_from_world(self, fixed: str, frame: str, time: int) -> np.ndarray | None:
         """[4, 4] at a time in ns, interpolated; None if `fixed` is no ancestor of `frame`, or no sample is near."""
@@ -81,25 +89,33 @@ class Poses:
         return interpolated_pose(times, matrices, time, MAX_GAP * 1e9)
 
 
-def read_poses(bag: Bag) -> Poses:
-    """All transforms of a bag; odometry adds frames that tf does not define. Of several topics with poses of one frame
-    the first is taken: a filter on tf and wheel odometry differ."""
-    poses, topics = Poses(), dict[str, str]()
+def read_poses(bag: Bag, odometry: str | None = None) -> Poses:
+    """All transforms of a bag; odometry adds frames that tf does not define, that of the topic `odometry` comes before
+    tf. Of several topics with poses of one frame the first is taken: a filter on tf and wheel odometry differ."""
+    poses, topics = Poses(), bag.of_type(ODOMETRY)
 
     def add(one: Recorded, entry: Any, child: str, position: Any, quaternion: Any, static: bool = False) -> None:
-        matrix = _matrix(position, quaternion)
+        matrix, used = _matrix(position, quaternion), poses.topics.setdefault(child.lstrip("/"), [])
         if matrix is None:
             bag.leave_out(one.topic, one.number, f"the pose of '{child}' is not finite, or no rotation")
-        elif topics.setdefault(child.lstrip("/"), one.topic) == one.topic:
+            return
+        if one.topic not in used:
+            used.append(one.topic)
+        if one.topic == used[0]:
             poses.add(entry.header.frame_id, child, stamp_of(entry), matrix, static)
 
+    def add_odometry(topics: list[str]) -> None:
+        for one in bag.messages(topics):
+            pose, child = one.message.pose.pose, one.message.child_frame_id or "base_link"
+            add(one, one.message, child, pose.position, pose.orientation)
+
+    if odometry is not None:
+        add_odometry([bag.chosen(topics, odometry, "odometry", "--odometry")])
     for one in bag.messages(bag.of_type(*TRANSFORMS)):
         for entry in one.message.transforms:
             static = one.topic.rstrip("/").endswith("static")
             add(one, entry, entry.child_frame_id, entry.transform.translation, entry.transform.rotation, static)
-    for one in bag.messages(bag.of_type(ODOMETRY)):
-        pose, child = one.message.pose.pose, one.message.child_frame_id or "base_link"
-        add(one, one.message, child, pose.position, pose.orientation)
+    add_odometry([topic for topic in topics if topic != odometry])
     return poses
 
 

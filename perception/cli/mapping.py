@@ -49,6 +49,7 @@ def register(commands: Any) -> None:
     p.add_argument("--camera-info", metavar="TOPIC", help="default: beside the images")
     p.add_argument("--camera", type=Path, metavar="FILE.yaml", help="a camera file instead of camera_info")
     p.add_argument("--fixed-frame", metavar="FRAME", help="the world (default: map, odom, world, or the tree's root)")
+    p.add_argument("--odometry", metavar="TOPIC", help="its poses before all others (default: tf, then the first)")
     p.add_argument(
         "--depth", metavar="TOPIC", help="none, or a topic (default: registered to the images, or the only one)"
     )
@@ -230,5 +231,5 @@ def _calibrate(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 def _frames(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.bags.frames import FrameOptions, run_frames
 
-    names = ("topic", "camera_info", "camera", "fixed_frame", "depth", "max_frames", "spacing", "strict")
+    names = ("topic", "camera_info", "camera", "fixed_frame", "odometry", "depth", "max_frames", "spacing", "strict")
     return run_frames(args.bag, args.output, FrameOptions(**{name: getattr(args, name) for name in names}))

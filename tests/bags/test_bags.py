@@ -129,10 +129,9 @@ def test_why_there_are_no_poses(tmp_path: Path) -> None:
     assert facts["with_pose"] == 0 and "no poses: no image lies between samples of odom" in text and "one clock" in text
 
 
-@pytest.mark.parametrize("tf", [True, False])
-def test_poses_of_one_frame_are_those_of_one_topic(tf: bool, tmp_path: Path) -> None:
+def two_odometries(path: Path, tf: bool) -> Path:
     """Wheel odometry goes astray between the samples of a filter on tf, or of another odometry."""
-    bag = Recorder(tmp_path / "drive", "mcap")
+    bag = Recorder(path, "mcap")
     bag.info("/camera_info", TIMES[0], (128, 96), K, D)
     bag.transform("/tf_static", TIMES[0], "base", "cam", BASE_FROM_CAM)
     for i, time in enumerate(TIMES):
@@ -142,13 +141,38 @@ def test_poses_of_one_frame_are_those_of_one_topic(tf: bool, tmp_path: Path) -> 
                 bag.transform("/tf", near, "odom", "base", pose(0.1 * i, 0.2 * i))
             else:
                 bag.odometry("/filtered", near, pose(0.1 * i, 0.2 * i))
-        bag.odometry("/a/wheels", time - 10_000_000, pose(0.1 * i, 0.2 * i + 1))
+        for near in (time - 10_000_000, time + 10_000_000):
+            bag.odometry("/a/wheels", near, pose(0.1 * i, 0.2 * i + 1))
     bag.close()
-    run_frames(tmp_path / "drive", tmp_path / "out")
+    return path
+
+
+@pytest.mark.parametrize("tf", [True, False])
+@pytest.mark.parametrize("asked", [None, "/a/wheels"])
+def test_poses_of_one_frame_are_those_of_one_topic_which_is_told(tf: bool, asked: str | None, tmp_path: Path) -> None:
+    drive = two_odometries(tmp_path / "drive", tf)
+    _, text = run_frames(drive, tmp_path / "out", FrameOptions(odometry=asked))
+    first, second = ("/tf" if tf else "/filtered", "/a/wheels")[:: 1 if asked is None else -1]
+    assert f"poses: 'base' by {first}, not {second} (--odometry TOPIC takes another)" in text
     for name, camera_from_world, _ in read_frames(tmp_path / "out" / "transforms.json"):
         number = int(Path(name).stem)
-        want = inverse_se3(pose(0.1 * number, 0.2 * number) @ BASE_FROM_CAM)
+        want = inverse_se3(pose(0.1 * number, 0.2 * number + (0 if asked is None else 1)) @ BASE_FROM_CAM)
         np.testing.assert_allclose(camera_from_world, want, atol=1e-9)
+
+
+def test_an_odometry_that_gives_no_pose_of_the_camera_is_refused(tmp_path: Path) -> None:
+    drive = two_odometries(tmp_path / "drive", tf=True)
+    with pytest.raises(InputError, match="no odometry topic '/vio'; found /a/wheels"):
+        run_frames(drive, tmp_path / "out", FrameOptions(odometry="/vio"))
+    bag = Recorder(tmp_path / "apart", "mcap")
+    bag.info("/camera_info", TIMES[0], (128, 96), K, D)
+    for i, time in enumerate(TIMES[:3]):
+        bag.jpeg("/compressed", time, cv2.imencode(".jpg", photo(i))[1].tobytes())
+        bag.transform("/tf", time, "map", "cam", np.eye(4))
+        bag.odometry("/wheels", time, np.eye(4))
+    bag.close()
+    with pytest.raises(InputError, match=r"--odometry /wheels: it has no pose of 'cam' or a frame above it \(map\)"):
+        run_frames(tmp_path / "apart", tmp_path / "out", FrameOptions(odometry="/wheels"))
 
 
 @pytest.mark.parametrize("topic", ["/cam/image_rect", "/cam/image_rect_color/compressed", "/cam/image_raw/compressed"])

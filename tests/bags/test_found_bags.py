@@ -100,6 +100,27 @@ def test_a_raw_depth_image_of_another_encoding(encoding: str, stored: np.ndarray
         assert facts["with_depth"] == COUNT and all(np.array_equal(d, MM) for d in depths(tmp_path / name))
 
 
+def test_of_two_depth_topics_one_is_asked_for_or_the_other_named(tmp_path: Path) -> None:
+    other = "/cam/depth/image_far"
+
+    def write(topic: str) -> Callable:
+        def both(bag: Recorder, number: int, time: int) -> None:
+            bag.image(DEPTH, time, MM, encoding="16UC1")
+            bag.image(topic, time, 2 * MM, encoding="16UC1")
+
+        return both
+
+    record(tmp_path / "a", depth=write(other))
+    with pytest.raises(InputError, match=f"several depth topics, choose one with --depth: {other}, {DEPTH}$"):
+        run_frames(tmp_path / "a", tmp_path / "out", ALL)
+    assert not (tmp_path / "out").exists()
+    run_frames(tmp_path / "a", tmp_path / "out", FrameOptions(depth=other, spacing=1e-3))
+    assert all(np.array_equal(d, 2 * MM) for d in depths(tmp_path / "out"))
+    record(tmp_path / "b", depth=write("/cam/depth/registered"))
+    _, text = run_frames(tmp_path / "b", tmp_path / "better", ALL)
+    assert "depth: /cam/depth/registered" in text and f"--depth TOPIC takes {DEPTH}" in text
+
+
 @pytest.mark.parametrize(
     "kind", ["16UC1; jpeg compressed ", "32FC1; jpeg compressed ", "jpeg", "16UC1; png compressed ", "mono8", "8UC1"]
 )
