@@ -55,7 +55,7 @@ _SYNONYMS = {
 }  # fmt: skip
 COLOR_WORDS, NOT = (*COLOR_NAMES, "many"), "not "
 """All that `color_words` returns, with NOT before it or without."""
-_NOT = re.compile(r"(?:\b(?:not|no|non|without)|n['’]t)(?: an?| the)?[ -]$", re.IGNORECASE)
+_NOT = re.compile(r"(?:\b(?:not|no|non|without|neither|nor)|n['’]t)(?: an?| the)?[ -]$", re.IGNORECASE)
 """What ends before a colour that a thing is not to have."""
 _MANY = {"colorful", "colourful", "multicolored", "multicoloured", "rainbow"}
 _PATTERN = re.compile(r"[^\W\d_]+")
@@ -72,16 +72,19 @@ def color_words(text: str) -> list[str]:
     found = list(_PATTERN.finditer(text))
     words = [match[0].lower() for match in found]
     names: list[str] = []
-    fruit = head_noun(text) == "orange"
+    fruit, ruled_out = head_noun(text) == "orange", -2
     for n, word in enumerate(words):
-        if (word, words[n + 1] if n + 1 < len(words) else "") in _NOT_A_COLOR:
+        before, after = words[n - 1] if n else "", words[n + 1] if n + 1 < len(words) else ""
+        if (word, after) in _NOT_A_COLOR:
             continue
-        if word == "orange" and (n == len(words) - 1 or fruit):
+        if word == "orange" and (fruit or not (after or before in ("is", "are", "not", "t"))):  # "isn't": "isn", "t"
             continue
         name = "many" if word in _MANY else _SYNONYMS.get(word, word)
         if name in _EXAMPLES or name == "many":
             start = found[n].start()
-            names.append(f"{NOT}{name}" if _NOT.search(text[max(0, start - 15) : start]) else name)
+            if _NOT.search(text[max(0, start - 15) : start]) or (before == "or" and ruled_out == n - 2):
+                name, ruled_out = f"{NOT}{name}", n
+            names.append(name)
     return list(dict.fromkeys(names))
 
 

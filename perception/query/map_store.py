@@ -23,6 +23,7 @@ from perception.io.json_shapes import check, parsed
 from perception.language.colors import COLOR_WORDS
 from perception.language.description import check_encoder
 from perception.language.encoders import make_encoder
+from perception.language.negation import negation_in
 from perception.language.printed import Printed, quoted_text
 from perception.language.shape_words import KINDS
 from perception.machine import torch_on_one_thread
@@ -165,6 +166,10 @@ class MapStore:
 
     def _scores(self, text: str) -> np.ndarray:
         """[I]: as `relations.ranked`, map by map: a map that has the text as a label takes it as a name."""
+        if (wrong := negation_in(text)) and not any(
+            tidy(label or "") == tidy(text) for names in self._maps.names for label in names["labels"]
+        ):
+            raise InputError(wrong)
         scores, relation = self.ranker.scores(text), parse(text)
         if relation is None or quoted_text(text) is not None:
             return scores

@@ -17,7 +17,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from perception.errors import InputError
 from perception.frame.gravity import up_from_cameras
+from perception.language.negation import negation_in
 from perception.language.printed import found_after_a_word, quoted_text
 from perception.language.shapes import level_frame, ramp
 from perception.map.map import Map
@@ -70,7 +72,10 @@ def parse(prompt: str) -> Relation | None:
 
 
 def ranked(ranker: Scorer, boxes: LevelBoxes | None, text: str) -> Answer:
-    """The ranking of the instances for a prompt, by the relation in it if there is one and z is known."""
+    """The ranking of the instances for a prompt, by the relation in it if there is one and z is known. InputError where
+    the prompt says what a thing is not (`negation_in`)."""
+    if wrong := negation_in(text):
+        raise InputError(wrong)
     relation = parse(text)
     if relation is None or boxes is None or quoted_text(text) is not None:
         return ranker.rank(text)

@@ -123,3 +123,11 @@ def test_no_prompt_is_longer_than_the_bound(paths: dict[str, Callable[[str], obj
     for ask in paths.values():
         with pytest.raises(InputError, match=f"{MAX_TEXT}"):
             ask("a" * (MAX_TEXT + 1))
+
+
+def test_no_path_answers_for_what_is_not(paths: dict[str, Callable[[str], object]]) -> None:
+    for ask in paths.values():
+        assert ask("drum that is not red") is not None
+        with pytest.raises(InputError, match="'no drum' says what a thing is not") as caught:
+            ask("no drum")
+        assert "\n" not in str(caught.value)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from perception.language.description import InstanceDescription
+from perception.language.negation import negation_in
 from perception.query.ranking import Ranker
 from perception.query.relations import LevelBoxes, Relation, parse, ranked
 
@@ -36,6 +37,28 @@ from perception.query.relations import LevelBoxes, Relation, parse, ranked
 )
 def test_parsing_by_hand(prompt: str, expected: tuple[str, str, str] | None) -> None:
     assert parse(prompt) == (expected and Relation(*expected))
+
+
+def test_prompts_that_say_what_a_thing_is_not() -> None:
+    refused = (
+        *("no mug", "Not a mug", "without a mug", "there is no mug", "none of the mugs", "a mug, not a bowl"),
+        *("mug not on the table", "mug that isn't on it", "mug that isn’t on it", "mug no longer on the table"),
+        *("everything except the mug", "anything but a mug", "mug neither on nor in the box", 'not "COKE"'),
+        *("no mug that is not red", "mug that is not red and not on the table", "mug not in the red box"),
+    )
+    answered = (
+        *(
+            "mug that is not red",
+            "mug, non-red",
+            "not a red mug",
+            "mug that is not red or blue",
+            "mug that is not orange",
+        ),
+        *("no smoking sign", "do not enter sign", '"no smoking"', 'mug that says "not today"', "mug without a handle"),
+        *("desk with no mug", "no-slip mat", "forget-me-not", "notebook", "knot", "all butter cookies", "nonstick pan"),
+    )
+    assert [text for text in refused if negation_in(text) is None] == []
+    assert [text for text in answered if negation_in(text) is not None] == []
 
 
 # low and high corners: a desk, a book on it, a mug on the book, a lamp on the desk's other end, a bin under the desk

@@ -121,6 +121,16 @@ def test_a_store_answers_as_its_maps_do_one_by_one(store: Path, maps: list[Path]
         assert [hit.instance_id for hit in many.query(text, 2, least)] == [hit.instance_id for hit in hits[:2]]
 
 
+def test_a_name_that_says_not_is_found_by_it(tmp_path: Path) -> None:
+    named = write_map_of(tmp_path / "a.gsmap", gaussians=200)
+    set_labels(named, {2: "not for sale"})
+    index_maps(tmp_path / "all.store", [named], encoders=encoders)
+    for path in (named, tmp_path / "all.store"):
+        assert [hit.instance_id for hit in load_map(path, encoders).query("Not for sale")] == [2]
+        with pytest.raises(InputError, match="says what a thing is not"):
+            load_map(path, encoders).query("not for rent")
+
+
 def test_the_prompts_above_are_about_something(maps: list[Path]) -> None:
     """Each kind of evidence changes scores in some of the maps, so that its absence from a store would be seen."""
     scores = {text: {key: hit.score for key, hit in one_by_one(maps, text, 1000, 0.0).items()} for text in PROMPTS}

@@ -1,0 +1,30 @@
+"""Prompts that say what a thing is not. English only."""
+
+from __future__ import annotations
+
+import re
+
+from perception.io.documents import brief
+from perception.language.colors import NOT, color_words
+from perception.language.printed import quoted_text
+from perception.language.shape_words import head_noun
+
+_NOT = re.compile(
+    r"^(?:there (?:is|are) )?(?:no|without|nothing|none)(?![-\w])|\bno longer\b|\b(?:all|anything|everything) but\b"
+    r"|(?<![-\w])(?:not|neither|nor|never|except)(?![-\w])|n['’]t\b",
+    re.IGNORECASE,
+)
+_SIGNS = ("sign", "poster", "placard", "sticker", "label", "notice", "symbol")
+"""Things whose names may say what not to do: "no smoking sign"."""
+
+
+def negation_in(text: str) -> str | None:
+    """The error of a prompt that says what a thing is not, beyond its colours, None of others: to encoders "mug" and
+    "no mug" are alike. Quoted texts may say so, and names of signs."""
+    quoted = quoted_text(text)
+    said = " ".join(text.split()) if quoted is None else quoted[0]
+    colors = sum(word.startswith(NOT) for word in color_words(said))
+    if len(_NOT.findall(said)) <= colors or head_noun(said) in _SIGNS:
+        return None
+    found = 'says what a thing is not, which is understood of colours alone ("mug that is not red")'
+    return f"query: {brief(text)} {found}; ask for what it is, and quote what is printed on it"
