@@ -194,7 +194,7 @@ def _redwood(source: Path) -> Recording:
     photos, depths = _images(folder), _images(source / "depth")
     if len(photos) != len(depths):
         raise InputError(f"{source}: {len(photos)} photos in {folder.name}/, {len(depths)} images in depth/; pair them")
-    logs = sorted(source.glob("*.log"))
+    logs = _visible(source, "*.log")
     named = [log for log in logs if log.name == "trajectory.log"] or logs
     if len(named) > 1:
         raise InputError(f"{source}: several trajectories ({', '.join(log.name for log in logs)}); keep one of them")
@@ -202,7 +202,7 @@ def _redwood(source: Path) -> Recording:
     frames = [Frame(f"{folder.name}/{photos[i].name}", photos[i], depths[i], pose) for i, pose in poses.items()]
     lens: Lens | InputError | None = None
     notes = _missing(len(photos) - len(poses), len(photos), "a pose")
-    if cameras := sorted(source.glob("*intrinsic*.json")) + sorted(source.glob("camera*.json")):
+    if cameras := _visible(source, "*intrinsic*.json") + _visible(source, "camera*.json"):
         lens = _tried(_open3d_lens, cameras[0])
     elif _first_size(photos) == _SIZE:
         lens = _lens(_PRIMESENSE, _SIZE)
@@ -225,10 +225,15 @@ def _trajectory(file: Path, photos: int) -> dict[int, np.ndarray]:
 
 def _images(folder: Path) -> list[Path]:
     """PNG and JPEG files in order of their numbers, which need not be padded with zeros."""
-    found = [path for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg")]
+    found = [path for path in _visible(folder, "*") if path.suffix.lower() in (".png", ".jpg", ".jpeg")]
     if not found:
         raise InputError(f"{folder}: holds no PNG or JPEG images")
     return sorted(found, key=lambda path: (len(path.stem), path.name))
+
+
+def _visible(folder: Path, pattern: str) -> list[Path]:
+    """What matches, sorted, without hidden files: macOS leaves "._0.txt" beside "0.txt" on other file systems."""
+    return sorted(path for path in folder.glob(pattern) if not path.name.startswith("."))
 
 
 def _numbers(file: Path, columns: int) -> np.ndarray:

@@ -48,6 +48,21 @@ def number(name: str, layout: str) -> int:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
+def test_hidden_files_that_macos_leaves_are_passed_over(layout: str, tmp_path: Path) -> None:
+    source = write_recording(tmp_path, layout)
+    before = open_recording(source)
+    for file in [path for path in source.rglob("*") if path.is_file()]:
+        file.with_name(f"._{file.name}").write_bytes(
+            b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X" + bytes(range(128, 256))
+        )
+    after = open_recording(source)
+    assert after.lens == before.lens and after.notes == before.notes
+    for a, b in zip(before.frames, after.frames, strict=True):
+        assert (a.name, a.photo, a.depth) == (b.name, b.photo, b.depth)
+        np.testing.assert_array_equal(a.world_from_camera, b.world_from_camera)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
 def test_poses_lenses_and_depth_of_each_layout(layout: str, tmp_path: Path) -> None:
     source = write_recording(tmp_path, layout)
     scene = loaded(source, tmp_path)
