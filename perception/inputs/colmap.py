@@ -147,10 +147,12 @@ def _located(folder: Path, model: Model) -> tuple[dict[int, tuple[str, Path]], l
     names = {number: safe_name(model.names[number], model.path) for number in model.reconstruction.reg_image_ids()}
     root = photo_folder(folder, model.path, list(names.values()))
     files, located, taken = NamedFiles(root), {}, set[Path]()
-    for image_id, name in sorted(names.items(), key=lambda item: not (root / item[1]).is_file()):
+    for image_id, name in sorted(names.items(), key=lambda item: (not (root / item[1]).is_file(), item[0])):
         photo = files.find(name)
         if photo is None or photo in taken:  # another image has that very name
             photo = root / "/".join(parts_of(name))
+        if photo in taken:
+            model.wrong.setdefault(image_id, "the model holds it more than once; the first pose is used")
         taken.add(photo)
         located[image_id] = (safe_name(photo.relative_to(root).as_posix(), model.path), photo)
     wrong = [

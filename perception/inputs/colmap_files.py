@@ -119,6 +119,10 @@ def _checked_text(model: Model) -> dict[int, int]:
         number, kind, *rest = line.split() if " " in line else (line, "")
         if not model.judge("cameras", int(_numbers([number], start)[0]), _numbers(rest, start)):
             rest[2:] = ["1"] * len(rest[2:])
+        found = f"camera {number} of model {brief(kind)} with {len(rest[2:])} parameters is not known to COLMAP"
+        with refusing(f"{start}: {found}; expected as in its documentation, Camera Models"):
+            if not load_pycolmap().Camera(model=kind, params=[1.0] * len(rest[2:])).verify_params():
+                raise ValueError
         cameras.append(" ".join([number, kind, *rest]))
     known = [line.partition(" ")[0] for line in cameras]
     for start, fields, points in _text_images(model):

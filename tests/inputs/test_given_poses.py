@@ -165,6 +165,24 @@ def test_a_photo_belongs_to_the_image_of_its_very_name(tmp_path: Path) -> None:
     assert [entry["name"] for entry in scene.report["left_out"]] == ["3.PNG"]
 
 
+def test_of_a_photo_that_a_model_holds_twice_the_first_pose_is_used(tmp_path: Path) -> None:
+    folder = workspace(tmp_path / "in")
+    write_model(folder / "sparse/0", [*NAMES[:7], NAMES[2]])
+    scene = loaded(folder)
+    check_poses(scene, list(range(7)))
+    assert [(e["name"], "more than once" in e["why"]) for e in scene.report["left_out"]] == [("2.png", True)]
+    with pytest.raises(InputError, match=r"1 of 8 photos cannot be used .*more than once"):
+        loaded(folder, strict=True)
+
+
+def test_a_camera_that_colmap_does_not_know_is_told_with_its_line(tmp_path: Path) -> None:
+    for camera in ("1 PINHOLE 64 48 60 61 32", "1 ODD 64 48 60 61 32 24"):
+        folder = workspace(tmp_path / "in", cameras=camera)
+        with pytest.raises(InputError, match=r"cameras.txt: line 3: camera 1 .*not.* known to COLMAP") as caught:
+            loaded(folder)
+        assert "\n" not in str(caught.value)
+
+
 def test_masks_and_labels_are_there_in_other_case(tmp_path: Path) -> None:
     scene = loaded(workspace(tmp_path / "in"))
     for name in NAMES:
