@@ -37,6 +37,9 @@ def rigid_pose(matrix: np.ndarray, what: str) -> np.ndarray:
     rotation = nearest_rotation(matrix[:3, :3])
     if np.abs(matrix[:3, :3] - rotation).max() > 1e-2:
         raise InputError(f"{what} is not a rigid transform (scaled, sheared or mirrored); repair or remove that frame")
+    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-3:
+        found = " ".join(f"{value:g}" for value in matrix[3])
+        raise InputError(f"{what} has the last row {found}, expected 0 0 0 1; is it stored column by column?")
     return transform(rotation, matrix[:3, 3])
 
 

@@ -110,6 +110,15 @@ def test_nerfstudios_lists_are_the_held_out_set(tmp_path: Path) -> None:
     assert [view.name for view in held] == NAMES[6:]
 
 
+def test_poses_stored_column_by_column_are_refused(tmp_path: Path) -> None:
+    """The rotation would be the inverse, and all cameras in one place."""
+    data = transforms(tmp_path / "in")
+    data["frames"] = [{**f, "transform_matrix": np.transpose(f["transform_matrix"]).tolist()} for f in data["frames"]]
+    (tmp_path / "in" / "transforms.json").write_text(json.dumps(data))
+    with pytest.raises(InputError, match=r"0.png has the last row -1 -3 1 1, expected 0 0 0 1; is it stored column"):
+        loaded(tmp_path / "in")
+
+
 def test_a_frame_without_its_pose_is_left_out(tmp_path: Path) -> None:
     data = transforms(tmp_path)
     del data["frames"][3]["transform_matrix"]
