@@ -15,7 +15,9 @@ from perception.errors import InputError
 from perception.io.documents import refusing
 from perception.types import Lens
 
-MIN_FOCAL, MOST_PIXELS, MOST_SIDE = 1e-2, 1e9, 1 << 20
+MOST_PIXELS, MOST_SIDE = 1e9, 1 << 20
+LEAST_FOCAL = 0.02
+"""Least focal length as a share of the photo's long side, a view of 175°: shorter ones are not in pixels."""
 _ASPECT = 0.02
 """Largest relative difference between aspect ratios that count as the same: sizes are whole pixels."""
 _PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
@@ -90,11 +92,12 @@ def pinhole_from_lens(lens: Lens) -> tuple[tuple[float, float, float, float], in
         ideal = ideal if plain else pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), ideal)
     fx, fy = float(ideal.focal_length_x), float(ideal.focal_length_y)
     cx, cy = float(ideal.principal_point_x), float(ideal.principal_point_y)
+    least = LEAST_FOCAL * max(lens.width, lens.height)
     # Beyond the range of real cameras, float32 cannot resolve the rays of pixels.
-    if not (min(fx, fy) >= MIN_FOCAL and max(fx, fy) <= MOST_PIXELS and max(abs(cx), abs(cy)) <= MOST_PIXELS):
+    if not (min(fx, fy) >= least and max(fx, fy) <= MOST_PIXELS and max(abs(cx), abs(cy)) <= MOST_PIXELS):
         raise InputError(
             f"camera {lens.model} {list(lens.params)}: seen as a pinhole of focal lengths {fx:g}, {fy:g} "
-            f"and centre {cx:g}, {cy:g}; expected {MIN_FOCAL:g} to {MOST_PIXELS:g} and at most {MOST_PIXELS:g} pixels"
+            f"and centre {cx:g}, {cy:g}; expected {least:g} to {MOST_PIXELS:g} and at most {MOST_PIXELS:g} pixels"
         )
     width, height = int(ideal.width), int(ideal.height)
     if min(width, height) < (1 if plain else 2) or max(width, height) > MOST_SIDE:

@@ -113,6 +113,7 @@ def test_distortion_of_transforms_against_opencv(changes, k, tmp_path):
         ({"camera_model": "OPENCV_FISHEYE", "p1": 0.02}, "p1 = 0.02"),
         ({"camera_model": "PINHOLE", "k1": 0.1}, "k1 = 0.1"),
         ({"distortion_params": [0.1, 0.02]}, r"found \[0.1, 0.02\]"),
+        ({"fl_x": 0.83, "fl_y": 1.25, "cx": 0.5, "cy": 0.5}, r"focal lengths 0.83, 1.25 .* expected 1.2 to .* pixels"),
     ],
 )
 def test_bad_transforms_are_one_clear_line(tmp_path, changes, words):
