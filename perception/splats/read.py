@@ -32,6 +32,8 @@ FLAT = 1e-3
 """Thickness of a disc relative to its smaller σ."""
 PARKED = -80.0
 """Logit of the opacity of rows that are not numbers: never drawn, and e^80 is a float32."""
+ROUNDED = 0.1
+"""Largest rounding of positions that are stored as float64, relative to the median σ."""
 CHUNK = 256
 """Gaussians that share the bounds of one row of `chunk` in a compressed PLY."""
 _REFUSED = "expected the properties of a Gaussian splat (x y z, opacity, scale_*, rot_*, f_dc_*)"
@@ -40,8 +42,8 @@ _REFUSED = "expected the properties of a Gaussian splat (x y z, opacity, scale_*
 @dataclass(frozen=True)
 class Splat:
     """Gaussians as a map stores them, float32: means [N, 3], quats [N, 4] wxyz of any length, log_scales [N, 3],
-    opacity_logits [N], sh [N, K, 3]. Rows that hold NaN, or an infinite mean or rotation, are parked: in the place of
-    the first good row, never drawn. parked [N] bool. notes: on how the file was read, one line each."""
+    opacity_logits [N], sh [N, K, 3]. Rows that hold NaN, or an infinite mean, rotation or colour, are parked: in the
+    place of the first good row, never drawn. parked [N] bool. notes: on how the file was read, one line each."""
 
     means: np.ndarray
     quats: np.ndarray
@@ -118,8 +120,9 @@ def _plain(path: Path, rows: Mapping[str, np.ndarray]) -> Splat:
 
     def table(names: list[str]) -> np.ndarray:
         values = np.empty((len(rows["x"]), len(names)), np.float32)
-        for i, name in enumerate(names):
-            values[:, i] = rows[name]
+        with np.errstate(over="ignore"):  # of float64: such a row is parked
+            for i, name in enumerate(names):
+                values[:, i] = rows[name]
         return values
 
     notes = []
@@ -146,6 +149,11 @@ def _plain(path: Path, rows: Mapping[str, np.ndarray]) -> Splat:
         quats = table([f"rot_{i}" for i in range(4)])
     notes += [] if turned else ["Gaussians have no rotation: there is no rot_0 to rot_3"]
     scales, opacity = _decoded(means, scales, opacity, notes)
+    if (good := np.isfinite(means).all(axis=1) & ~np.isnan(scales).any(axis=1)).any():
+        rounded = max(float(np.median(np.abs(rows[a][good] - means[good, i]))) for i, a in enumerate("xyz"))
+        if rounded > ROUNDED * (sigma := float(np.exp(np.median(scales[good])))):
+            found = f"lies so far from its origin that float32 rounds positions by {rounded:.2g}, and σ is {sigma:.2g}"
+            raise InputError(f"{path}: {found}; move the scene to its origin")
     return Splat(means, quats, scales, opacity, sh, notes=notes)
 
 
@@ -220,7 +228,7 @@ def _parked(path: Path, splat: Splat) -> Splat:
     for values in (splat.means, splat.quats):
         bad |= ~np.isfinite(values).all(axis=1)
     bad |= (np.isnan(splat.log_scales) | (splat.log_scales == np.inf)).any(axis=1)
-    bad |= np.isnan(splat.sh).any(axis=(1, 2))
+    bad |= ~np.isfinite(splat.sh).all(axis=(1, 2))
     good = np.flatnonzero(~bad)
     if len(good) < LEAST_ROWS or not (np.ptp(splat.means[good], axis=0) > 0).any():
         what = f"{len(good)} of {len(splat)} rows are numbers" if len(good) < LEAST_ROWS else "all lie in one place"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import struct
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -105,13 +106,28 @@ def test_rows_that_are_no_numbers_are_kept_and_counted(tmp_path: Path) -> None:
     values = columns(0)
     values["x"][3], values["opacity"][5], values["scale_1"][7], values["rot_0"][9] = np.nan, np.nan, np.inf, np.inf
     values["opacity"][11] = np.inf  # opaque, as some tools write it
-    splat = read_splat(write(tmp_path / "a.ply", values))
-    assert np.flatnonzero(splat.parked).tolist() == [3, 5, 7, 9]
+    values["f_dc_1"][13], values["y"] = np.inf, values["y"].astype(np.float64)
+    values["y"][15], values["z"][17] = 1e300, np.inf
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        splat = read_splat(write(tmp_path / "a.ply", values))
+    assert np.flatnonzero(splat.parked).tolist() == [3, 5, 7, 9, 13, 15, 17]
     assert len(splat) == COUNT
     with np.errstate(all="raise", under="ignore"):  # a warning would reach the user
         assert np.all(1 / (1 + np.exp(-splat.opacity_logits[splat.parked])) < 1e-30)
     assert all(np.isfinite(splat.arrays()[name]).all() for name in ("means", "quats", "sh"))
-    assert any("4 Gaussians that are not finite" in note for note in splat.notes)
+    assert any("7 Gaussians that are not finite" in note for note in splat.notes)
+
+
+def test_positions_that_float32_cannot_hold_are_refused(tmp_path: Path) -> None:
+    """5.4 million metres north, as of a georeferenced scene: neighbouring float32 numbers are half a metre apart."""
+    for north, refused in ((5.4e6, True), (5.4e3, False)):
+        path = write(tmp_path / "a.ply", changed(y=lambda v, n=north: v["y"].astype(np.float64) + n))
+        if refused:
+            with pytest.raises(InputError, match=r"rounds positions by 0.1\d, and σ is 0.018; move the scene"):
+                read_splat(path)
+        else:
+            assert len(read_splat(path)) == COUNT
 
 
 def turned(degree: int) -> np.ndarray:
