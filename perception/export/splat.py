@@ -67,9 +67,8 @@ def _rows(gmap: Map, map_path: Path) -> np.ndarray:
     names = [name for name in own.dtype.names or () if name in (given.dtype.names or ()) and name[0] != "n"]
     if len(given) != len(own) or "x" not in names:
         return own
-    good = np.ones(len(own), bool)
+    parked = np.zeros(len(own), bool)
     for name in names:
-        good &= ~np.isnan(given[name])
-    parked = ~good | np.isinf(given["x"]) | np.isinf(given["y"]) | np.isinf(given["z"])
+        parked |= ~np.isfinite(given[name])
     same = all(bool(((given[name] == own[name]) | parked).all()) for name in names)
     return given if same else own

@@ -13,7 +13,9 @@ from perception.errors import InputError
 from perception.export.export_map import ExportOptions, export_map
 from perception.export.splat import export_splat
 from perception.io.cloud import read_cloud
+from perception.io.ply import map_ply, write_ply
 from perception.map.write import write_map
+from perception.splats.read import read_splat
 from support.viewer_maps import small_map
 from support.visited_map import STATES, number, write_visited_map
 
@@ -96,3 +98,21 @@ def test_what_is_gone_has_no_splat(tmp_path: Path) -> None:
     assert {Path(file) for file in facts["splat"]} == written == set(tmp_path.glob("s*.ply"))
     with pytest.raises(InputError, match=f"no Gaussians of an instance {number('mug')}"):
         export_splat(path, tmp_path / "s.ply", only=[number("mug")])
+
+
+@pytest.mark.parametrize("name", ["x", "rot_1", "f_dc_0", "scale_2"])
+def test_rows_of_a_splat_that_are_no_numbers_come_back(name: str, tmp_path: Path) -> None:
+    gmap = small_map(80)
+    gmap.info |= {"source": str(tmp_path / "in.ply"), "scene": {"input": "splat"}}
+    write_map(tmp_path / "m.gsmap", gmap)
+    stored = map_ply(tmp_path / "m.gsmap" / "gaussians.ply", "vertex")
+    given = {key: np.array(stored[key]) for key in stored.dtype.names or ()}
+    given[name][5], given["quality"] = np.inf, np.arange(80, dtype=np.int32)
+    write_ply(tmp_path / "in.ply", {"vertex": given})
+    parked = read_splat(tmp_path / "in.ply")
+    gmap.opacity_logits[5], gmap.means[5] = parked.opacity_logits[5], parked.means[5]
+    write_map(tmp_path / "m.gsmap", gmap)
+    export_splat(tmp_path / "m.gsmap", tmp_path / "out.ply")
+    back = map_ply(tmp_path / "out.ply", "vertex")
+    for key, values in given.items():
+        np.testing.assert_array_equal(back[key], values)
