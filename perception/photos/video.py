@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -106,7 +107,8 @@ def video_frames(video: Path, folder: Path, progress: Progress) -> dict[str, obj
     record |= {"frames": numbers[-1] + 1, "chosen": len(chosen)}
     with atomic_directory(folder, fresh=True) as aside:
         for number, share, frame in frames(video, set(chosen)):
-            cv2.imwrite(str(aside / f"{number:06d}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+            data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+            (aside / f"{number:06d}.jpg").write_bytes(data)
             progress.update("poses: writing frames", round(100 * share), 100)
         (aside / FRAMES_RECORD).write_text(json.dumps(record), encoding="utf-8")
     return record
@@ -117,6 +119,8 @@ def frames(
 ) -> Iterator[tuple[int, float, np.ndarray]]:
     """(number, share of the video, BGR [h, w, 3] uint8) of the `wanted` frames, upright.
     Without `wanted`, every n-th frame: LOOKS_PER_SECOND, or about `most` in all. None where the video is unreadable."""
+    if os.fsencode(video) != str(video).encode(errors="replace"):  # OpenCV would crash
+        raise InputError(f"{video}: the path holds bytes that are no UTF-8; rename the video")
     capture = cv2.VideoCapture(str(video))
     try:
         with refusing(f"{video}: {_UNREADABLE}"):

@@ -161,8 +161,7 @@ def _with_renders(
 
 def _written(view: View, seen: Rendered, folder: Path) -> View:
     view.photo.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(view.photo), seen.colors[:, :, ::-1]):
-        raise InputError(f"{view.photo}: cannot be written; free some disk, or choose another -o")
+    view.photo.write_bytes(cv2.imencode(".png", seen.colors[:, :, ::-1])[1].tobytes())
     return replace(view, depth=_depth_file(folder, view.name, seen.depth))
 
 

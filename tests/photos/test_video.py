@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 from pathlib import Path
 
 import cv2
@@ -15,6 +17,7 @@ from perception.inputs.load import load_scene, photo_sizes
 from perception.photos.folder import list_photos
 from perception.photos.video import FRAMES_RECORD, frame_size, video_frames
 from perception.pipeline.checkpoint import frames_folder, working
+from perception.progress import QUIET
 from perception.sfm.options import ReadOptions
 from support.progress import Told
 from support.videos import turn_video, write_video
@@ -79,6 +82,17 @@ def test_files_that_are_no_video(tmp_path: Path) -> None:
     (tmp_path / "v.frames").mkdir()
     with pytest.raises(InputError, match=r"v\.frames: exists already"):
         load_scene(file, ReadOptions(tmp_path / "work", frames=tmp_path / "v.frames"))
+
+
+def test_names_that_are_no_utf8(tmp_path: Path) -> None:
+    """OpenCV crashes on such a path; frames are written where the map is, under any name."""
+    video = write_video(tmp_path / "v.mp4", pan(30))
+    odd = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xe9"))
+    odd.mkdir()
+    assert video_frames(video, odd / "v.frames", QUIET)["chosen"] == len(list((odd / "v.frames").glob("*.jpg"))) > 1
+    shutil.copyfile(video, odd / "v.mp4")
+    with pytest.raises(InputError, match="the path holds bytes that are no UTF-8; rename the video"):
+        frame_size(odd / "v.mp4")
 
 
 def test_a_video_that_cannot_be_posed_leaves_no_frames(tmp_path: Path) -> None:
