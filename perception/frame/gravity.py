@@ -174,7 +174,8 @@ def _planes(points: np.ndarray, down: np.ndarray, near: float, seed: int) -> tup
 
 def floor_height(up: np.ndarray, points: np.ndarray, eye: np.ndarray) -> float:
     """Height along `up` of the floor below a camera at `eye` [3]: the lowest level slab that holds many points.
-    Without such a slab it is the height that 1 % of the points lie below; without points that of the camera."""
+    Without such a slab it is the height that 1 % of the points lie below, at most that of the camera; without points
+    below the camera it is the camera's."""
     heights = np.sort(np.asarray(points, np.float64) @ up)
     below = heights[heights < eye @ up]
     if len(below) < 30:
@@ -183,6 +184,8 @@ def floor_height(up: np.ndarray, points: np.ndarray, eye: np.ndarray) -> float:
     slab = 2 * THICKNESS * (high - low) + 1e-12
     counts = np.searchsorted(below, below + slab) - np.arange(len(below))
     many = np.flatnonzero(counts >= max(LEAST_SHARE * len(heights) / 2, 0.5 * counts.max()))
-    first = many[0] if below[many[0]] >= low - slab else np.searchsorted(below, low)
+    if len(many) == 0:
+        return float(min(low, eye @ up))
+    first = many[0]
     end = first + counts[first : first + counts[first]].argmax()
     return float(np.median(below[end : end + counts[end]]))

@@ -71,3 +71,11 @@ def test_the_floor_is_the_lowest_slab_of_many_points() -> None:
     assert floor_height(up, points, eye) == pytest.approx(0.3, abs=0.01)
     assert floor_height(up, points[:0], eye) == 1.5
     assert floor_height(-up, -points, -eye) == pytest.approx(0.3, abs=0.01)  # the same scene, upside down
+
+
+@pytest.mark.parametrize(("heights", "floor"), [((-1, 3), -0.96), ((1, 10), 0.0)])
+def test_without_a_slab_the_floor_is_where_few_points_lie_below(heights: tuple[float, float], floor: float) -> None:
+    """Evenly spread points, 1 % of which lie below the floor; and a camera below all but 40 strays of them."""
+    z = np.r_[np.linspace(*heights, 8000), np.linspace(-3, -2, 40 if floor == 0 else 0)]
+    points = np.c_[np.zeros((len(z), 2)), z]
+    assert floor_height(np.array([0.0, 0, 1]), points, np.zeros(3)) == pytest.approx(floor, abs=1e-6)
