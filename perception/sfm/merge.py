@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from itertools import combinations
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -109,7 +110,7 @@ def merged(models: Sequence[Any]) -> Any:
             cameras.setdefault(number, []).append(camera)
     model = pycolmap.Reconstruction()
     for number in sorted({image.camera_id for image in best.values()}):
-        camera = cameras[number][0]
+        camera = copy(cameras[number][0])
         camera.params = np.median([one.params for one in cameras[number]], axis=0)
         model.add_camera_with_trivial_rig(camera)
     for number, image in sorted(best.items()):

@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from perception.sfm.merge import MATCHED, Matches, align_by_matches, part_of
+from perception.sfm.merge import MATCHED, Matches, align_by_matches, merged, part_of
 
 
 def scene() -> tuple[pycolmap.Reconstruction, set[int], set[int], Matches]:
@@ -51,3 +51,15 @@ def test_few_matched_points_say_nothing() -> None:
     few = {pair: matches[pair][: MATCHED - 1]}
     other = part_of(model, second)
     assert not align_by_matches(part_of(model, first), other, few, seed=0)
+
+
+def test_models_that_are_merged_keep_their_own_intrinsics() -> None:
+    """Each is still a candidate if the merged one is worse."""
+    model, first, second, _ = scene()
+    models, camera = [part_of(model, first), part_of(model, second)], model.images[min(first)].camera_id
+    for each, factor in zip(models, (1.0, 1.2), strict=True):
+        each.cameras[camera].params = factor * model.cameras[camera].params
+    found = merged(models).cameras[camera].params
+    np.testing.assert_allclose(found, 1.1 * model.cameras[camera].params)
+    for each, factor in zip(models, (1.0, 1.2), strict=True):
+        np.testing.assert_array_equal(each.cameras[camera].params, factor * model.cameras[camera].params)
