@@ -110,7 +110,7 @@ def build_features(
 def _key(
     photos: list[Path], lenses: list[Lens | None], search: tuple[int, ...], masks: list[Path | None] | None
 ) -> str:
-    paths = [*photos, *(mask for mask in masks or () if mask is not None)]
-    files = [(str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns) for path in paths]
+    paths = [*photos, *(masks or ())]
+    files = [path and (str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns) for path in paths]
     constants = [{name: of for name, of in vars(module).items() if name.isupper()} for module in (features, pairs)]
     return hashlib.sha256(repr((files, lenses, constants, search)).encode()).hexdigest()[:12]

@@ -394,3 +394,13 @@ def test_a_zoom_of_0_over_0_is_one_camera(tmp_path: Path) -> None:
 
 def test_a_camera_without_pixels_fits_no_photo(tmp_path: Path) -> None:
     assert fit_lens(Lens("PINHOLE", (60.0, 60.0, 0.0, 0.0), 0, 0), save(tmp_path / "a.png", 0), False) is None
+
+
+def test_features_are_made_anew_where_a_mask_is_of_another_photo(tmp_path: Path) -> None:
+    photos = [save(tmp_path / name, 0) for name in ("0.jpg", "1.jpg")]
+    mask = tmp_path / "mask.png"
+    Image.new("L", (160, 120)).save(mask)
+    for masks in ([mask, None], [None, mask]):
+        store = build_features(photos, [None, None], ReadOptions(tmp_path / "work"), masks)
+        staged = [np.asarray(Image.open(store.folder / "masks" / f"{name}.png")) for name in store.names]
+        assert [bool(picture.any()) for picture in staged] == [given is None for given in masks]
