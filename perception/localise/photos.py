@@ -40,7 +40,7 @@ def new_photos(sources: Sequence[Path], camera: Path | None, workdir: Path, prog
         elif source.suffix.lower() in VIDEO_SUFFIXES and source.is_file():
             raise InputError(f"{source}: is a video; localise takes photos, such as frames of it")
         elif (reader := reader_of(source)).poses:
-            options = ReadOptions(workdir, progress=progress, poses="keep", cloud=NO_POINTS, lens=lens)
+            options = ReadOptions(workdir, progress=progress, poses="keep", cloud=NO_POINTS, lens=lens, still=False)
             views = reader.read(source, options).views
             found += [NewPhoto(v.name, v.photo, view_lens(v), v.depth, v.mask, v.as_stored) for v in views]
             unused = unused if reader.cameras else None

@@ -26,6 +26,7 @@ from perception.map.map import Map
 from perception.map.write import read_map, write_map
 from perception.photos.camera_file import camera_data
 from perception.photos.lens import camera_from_lens
+from perception.photos.still import with_still
 from perception.photos.view_json import frame_facts
 from perception.pipeline.optimise import Run
 from perception.progress import QUIET
@@ -250,3 +251,20 @@ def test_every_lens_is_written_so_that_it_sees_the_same(model: str, params: tupl
 def test_a_lens_without_keys_is_refused() -> None:
     with pytest.raises(perception.InputError, match="FOV cannot be written"):
         lens_values(Lens("FOV", (300.0, 300.0, 200.0, 150.0, 0.5), 400, 300))
+
+
+def test_posed_photos_bring_no_masks_of_what_stays_in_the_picture(folder: Path, tmp_path: Path) -> None:
+    """These are found when the photos are localised, in a folder that lasts until then."""
+    room, rng = PaintedRoom(0), np.random.default_rng(0)
+    thing, frames = rng.integers(0, 255, (60, 120, 3), np.uint8), []
+    for n, pose in enumerate(walk(1, 5, 0.15)):
+        picture = room.photo(pose)[0]
+        picture[-60:, 140:260] = thing
+        cv2.imwrite(str(tmp_path / f"{n}.png"), picture)
+        frames.append({"file_path": f"{n}.png", "transform_matrix": np.linalg.inv(pose).tolist()})
+    lens = lens_values(Lens("PINHOLE", (FOCAL, FOCAL, 200.0, 150.0), 400, 300))
+    (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+    new = new_photos([tmp_path], None, tmp_path / "work", QUIET)
+    paths, sizes, none = [photo.photo for photo in new], [(400, 300)] * 5, [None] * 5
+    assert [photo.mask for photo in new] == none and not (tmp_path / "work").exists()
+    assert all(with_still(paths, sizes, none, tmp_path / "still", QUIET).masks)  # there is such a thing
