@@ -44,7 +44,7 @@ def divide(matches: Matches, most: int) -> list[list[int]]:
 def _upper_half(weights: sparse.csr_matrix) -> np.ndarray:
     """[n] bool of symmetric weights [n, n]."""
     count = weights.shape[0]
-    degree = np.asarray(weights.sum(axis=1)).ravel()
+    degree = np.maximum(np.asarray(weights.sum(axis=1)).ravel(), 1)  # a photo whose matches a cut took has none
     scaled = sparse.diags(degree**-0.5)
     start = np.random.default_rng(0).normal(size=count)  # ARPACK's own is random
     vector = eigsh(scaled @ weights @ scaled, k=2, which="LA", v0=start)[1][:, 0] * degree**-0.5

@@ -50,6 +50,16 @@ def test_unconnected_photos_are_in_different_submodels() -> None:
     assert partition.divide({**first, **second}, 100) == [list(range(1, 9)), list(range(21, 29))]
 
 
+def test_a_photo_whose_only_match_is_beyond_a_cut_is_divided_as_well() -> None:
+    """A scene without narrow places, and photos that match one other each: every photo is in one small submodel."""
+    rng = np.random.default_rng(0)
+    pairs = [(i, int(j)) for i in range(120) for j in rng.choice(120, 4, replace=False) if i != j]
+    matches = {(min(pair), max(pair)): 100 for pair in pairs} | {(i, 120 + i): 15 for i in range(60)}
+    with np.errstate(all="raise"):
+        parts = partition.divide(matches, 20)
+    assert max(map(len, parts)) <= 20 and sorted(image for part in parts for image in part) == list(range(180))
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_the_cut_is_the_least_along_the_eigenvector(seed: int) -> None:
     """The dense eigenvector of the generalised problem and all cuts along it, by their definition."""
