@@ -12,6 +12,8 @@ from perception.photos.lens import camera_from_lens
 ANGLE, SCALE = np.cos(np.radians(30.0)), 2.0
 """A point is expected in a photo if a photo of the map shows it from a direction that differs by less than this angle,
 from at most SCALE times nearer or farther: features match that much."""
+SAME_RAY = 0.01
+"""Relative difference of rays up to which they are one; those that a lens confuses differ by far more."""
 GRID = 8
 """The picture is judged in GRID × GRID cells; one with at least LEAST_POINTS expected points should show a feature."""
 LEAST_POINTS = 3
@@ -41,7 +43,12 @@ def _expected(reference: Reference, pose: Pose) -> np.ndarray:
     far, near = np.linalg.norm(before, axis=1), np.linalg.norm(now, axis=1)
     alike = ((before * now).sum(axis=1) > ANGLE * far * near) & (near < SCALE * far) & (far < SCALE * near)
     x = reference.points[np.unique(point[alike])] @ rotation.T + shift
-    return np.asarray(camera_from_lens(pose.lens).img_from_cam(x[x[:, 2] > 0]), np.float64).reshape(-1, 2)
+    x, camera = x[x[:, 2] > 0], camera_from_lens(pose.lens)
+    pixel = np.asarray(camera.img_from_cam(x), np.float64).reshape(-1, 2)
+    back = np.asarray(camera.cam_from_img(pixel), np.float64).reshape(-1, 2)
+    rays = x[:, :2] / x[:, 2:]
+    # A polynomial of distortion leads rays from far outside the picture into it: those do not come back.
+    return pixel[np.linalg.norm(back - rays, axis=1) < SAME_RAY * (1 + np.linalg.norm(rays, axis=1))]
 
 
 def _cells(pixel: np.ndarray, size: np.ndarray) -> np.ndarray:
