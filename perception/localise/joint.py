@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from perception.localise.keypoints import Described, triangulated
 from perception.localise.reference import Reference
-from perception.sfm.bundle_adjustment import Poses, adjust, residuals
+from perception.sfm.bundle_adjustment import Adjusted, Poses, adjust, residuals
 from perception.sfm.consistency import Pair, stronger_contradictions
 from perception.sfm.pose_refinement import match_errors
 from perception.sfm.tracks import Features, grouped, observed
@@ -23,15 +24,20 @@ keeps the equations regular and weighs nothing beside features."""
 @dataclass(frozen=True)
 class Adjustment:
     """poses: of the map's V views, then of N new photos. point [F of the new]: of each new feature, −1 = none.
-    points [P, 3]. covariance: [6, 6] by number of the new photo, of rotation vector (map axes, radians) and position.
-    inliers, rms: by number: features that agree, and their error in pixels."""
+    points [P, 3]. inliers, rms: by number of the new photo: features that agree, and their error in pixels."""
 
     poses: Poses
     point: np.ndarray
     points: np.ndarray
-    covariance: dict[int, np.ndarray]
     inliers: dict[int, int]
     rms: dict[int, float]
+    _found: Adjusted | None
+
+    @cached_property
+    def covariance(self) -> dict[int, np.ndarray]:
+        """[6, 6] by number of the new photo, of rotation vector (map axes, radians) and position. Of all at once, which
+        takes the cube of their number: only when asked for."""
+        return {} if self._found is None else dict(zip(self.inliers, self._found.covariances(), strict=True))
 
 
 def joined(reference: Reference, new: Features, pairs: np.ndarray) -> Features:
@@ -71,12 +77,11 @@ def adjusted(
     owner = np.full(len(new.features.view), -1, np.int64)
     owner[kept[of_new] - shift] = number[of_new]
     numbers = (used[free] - count).tolist() if len(used) else []
-    covariance = dict(zip(numbers, found.covariances(), strict=True)) if numbers else {}
     error = np.hypot(*residuals(tracks, found.poses, found.points)[0].T) if numbers else np.empty(0)
     errors = {n: error[index == np.searchsorted(used, n + count)] for n in numbers}
     inliers = {n: len(each) for n, each in errors.items()}
     rms = {n: float(np.sqrt(np.mean(each**2))) for n, each in errors.items()}
-    return Adjustment(poses, owner, found.points if numbers else points, covariance, inliers, rms)
+    return Adjustment(poses, owner, found.points if numbers else points, inliers, rms, found if numbers else None)
 
 
 def contradicted(reference: Reference, new: Described, found: Adjustment, placed: set[int], most: float) -> int | None:
@@ -85,9 +90,10 @@ def contradicted(reference: Reference, new: Described, found: Adjustment, placed
     is none."""
     views, good = new.features.view[new.features.pairs], _agreeing(new, found.poses, len(reference.views), most)
     pairs = [Pair(-1, number, found.inliers[number], 1.0) for number in sorted(placed)]
-    for i, j in np.unique(views[np.isin(views, list(placed)).all(axis=1)], axis=0).tolist():
-        between = (views == (i, j)).all(axis=1)
-        pairs.append(Pair(i, j, int(between.sum()), float(good[between].mean())))
+    rows = np.isin(views, list(placed)).all(axis=1)
+    both, index, counts = np.unique(views[rows], axis=0, return_inverse=True, return_counts=True)
+    shares = np.bincount(index.ravel(), good[rows], len(both)) / counts
+    pairs += map(Pair, *both.T.tolist(), counts.tolist(), shares.tolist())
     wrong = {number for pair in stronger_contradictions(pairs) for number in (pair.i, pair.j)}
     return min(wrong, key=lambda number: (found.inliers[number], number), default=None)
 
