@@ -109,7 +109,7 @@ def numbers(value: Any, name: str, expected: str = "numbers") -> np.ndarray:
     """`value` as a float64 array; InputError unless it holds finite numbers."""
     try:
         array = np.asarray(value, np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{name}: expected {expected}, found {str(value)[:60]!r}") from error
     if not np.isfinite(array).all():
         raise InputError(f"{name}: expected finite numbers, found {str(value)[:60]!r}")

@@ -10,7 +10,8 @@ import torch
 from scipy.spatial import cKDTree
 
 from perception import geometry
-from perception.geometry import along_curve, nearest, sums_by
+from perception.errors import InputError
+from perception.geometry import along_curve, nearest, numbers, sums_by
 
 
 @pytest.mark.parametrize("shape", [(7,), (7, 3), (0,), (0, 3), (0, 2, 3)])
@@ -76,3 +77,9 @@ def test_a_signal_waits_for_the_search_that_runs() -> None:
     with pytest.raises(KeyboardInterrupt):
         nearest(Tree(), np.zeros((geometry.AT_ONCE + 1, 3)), [1, 2])  # type: ignore[arg-type]
     assert done == [geometry.AT_ONCE]
+
+
+@pytest.mark.parametrize("value", [[10**400], ["x"], [None], [float("nan")], [float("inf")]])
+def test_what_is_no_finite_number_is_refused(value: list[object]) -> None:
+    with pytest.raises(InputError, match=r"^near: expected "):
+        numbers(value, "near")
