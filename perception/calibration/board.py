@@ -141,9 +141,10 @@ class Board:
     @classmethod
     def from_text(cls, text: str) -> Board:
         """The board of "KIND:COLSxROWS:SQUARE[:MARKER[:DICTIONARY]]"; the marker is 3/4 of the square by default."""
-        kind, squares, square, marker, dictionary = (*text.split(":"), *[""] * 5)[:5]
+        parts = text.split(":")
         expected = "expected KIND:COLSxROWS:SQUARE[:MARKER[:DICTIONARY]] such as charuco:8x11:0.02"
         try:
+            kind, squares, square, marker, dictionary = parts + [""] * (5 - len(parts))
             columns, rows = (int(side) for side in squares.lower().split("x"))
             side = float(square)
             return cls(kind, (columns, rows), side, float(marker or 0.75 * side), dictionary or "5X5_100")

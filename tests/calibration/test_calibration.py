@@ -225,6 +225,8 @@ def test_a_board_of_more_markers_than_its_dictionary_has() -> None:
     assert Board.from_text("charuco:10x10:0.03:0.022:4X4_50").squares == (10, 10)
     with pytest.raises(InputError, match="has 50 markers, a board of 12x9 squares needs 54"):
         Board.from_text("charuco:12x9:0.03:0.022:4X4_50")
+    with pytest.raises(InputError, match="expected KIND:COLSxROWS"):
+        Board.from_text("charuco:10x10:0.03:0.022:4X4_50:0.5")
 
 
 def test_what_macs_leave_beside_photos_is_no_photo(tmp_path) -> None:
