@@ -27,7 +27,9 @@ SIDE, MARGIN, PATCH = 240, 40, 0.4
 """A tag as an image: its side and white margin in pixels; size in sides from which `refine` takes its patches."""
 CORNER_ERROR, CLICK_ERROR = 0.15, 1.0
 """Least standard deviation in pixels of a detected corner, and of a pixel that a person chose."""
-MISSHAPEN = 0.1  # largest deviation of triangulated corners from the true shape, in its size
+MISSHAPEN = 0.1
+"""Largest deviation of triangulated corners from the true shape, in its size; and of the rays from the corners, in its
+size in the pictures: the rays to a thing that was moved do not meet."""
 DRAWS = 32  # of the noise of pixels
 
 
@@ -45,6 +47,7 @@ def scale_of_tags(views: Sequence[View], size: float) -> Measurement:
     square = size * np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    refused = None
     for family in TAG_FAMILIES:
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{family}"))
         detector = cv2.aruco.ArucoDetector(dictionary, parameters)
@@ -61,10 +64,14 @@ def scale_of_tags(views: Sequence[View], size: float) -> Measurement:
                 )
                 sighting.rays[number] = rays_of_pixels(view, pixels + 0.5)
         shown = [s for s in seen.values() if np.isfinite(s.rays[:, 0, 0]).sum() >= 2]
-        if shown:
-            return scale_of_sightings(views, shown, CORNER_ERROR, f"{len(shown)} {family} tags of {size:g} m")
+        try:
+            if shown:
+                return scale_of_sightings(views, shown, CORNER_ERROR, f"{len(shown)} {family} tags of {size:g} m")
+        except InputError as error:  # what looks like tags of this family are none, or moved
+            refused = refused or error
     families = ", ".join(TAG_FAMILIES)
-    raise InputError(f"tag size: no tag of {families} is seen in two of the {len(views)} photos; take photos with it")
+    none = f"tag size: no tag of {families} is seen in two of the {len(views)} photos; take photos with it"
+    raise refused or InputError(none)
 
 
 def scale_of_board(views: Sequence[View], board: Board) -> Measurement:
@@ -117,10 +124,12 @@ def scale_of_sightings(
         seen = np.isfinite(residuals)
         freedom = max(int(seen.sum()) - 3 * len(thing.corners) - 2, 1)  # 2 less: few residuals underestimate the noise
         noise = max(pixel_error / focal, float(np.sqrt((residuals[seen] ** 2).sum() / freedom)))
+        sizes = [np.linalg.norm(np.ptp(r[np.isfinite(r[:, 0])], axis=0)) for r in rays if np.isfinite(r).any()]
+        meets = np.sqrt((residuals[seen] ** 2).mean()) < MISSHAPEN * np.median(sizes)
         drawn = [_fitted(poses, thing.corners, rays + noise * rng.standard_normal(rays.shape)) for _ in range(DRAWS)]
         metres, off = _fitted(poses, thing.corners, rays)
         error = float(np.std([unit for unit, _ in drawn]))
-        if error < LARGEST_ERROR * metres and off < MISSHAPEN:  # false for NaN
+        if meets and error < LARGEST_ERROR * metres and off < MISSHAPEN:  # false for NaN
             usable.append((thing.corners, rays, error))
     if not usable:
         raise InputError(f"{source}: its corners cannot be triangulated to its shape; see it from farther apart")

@@ -120,6 +120,37 @@ def test_tags_and_boards_are_found_in_photos(tmp_path: Path) -> None:
         scale_of_tags([replace(p, photo=_grey(tmp_path)) for p in posed], 0.16)
 
 
+def test_a_tag_that_was_moved_between_two_photos_is_not_used() -> None:
+    """It faces both cameras, and between its places it looks square; but the rays to its corners do not meet."""
+    views = cameras("orbit", 30)[:6:5]
+    places = np.array([[-0.2, -0.2], [0.25, 0.4]])
+    thing = Sighting(0.08 * SQUARE, 0.12 * SQUARE[:, :2] + places[:, None])
+    with pytest.raises(InputError, match="a tag: its corners cannot be triangulated"):
+        scale_of_sightings(views, [thing], 0.15, "a tag")
+
+
+def test_tags_are_found_beside_what_looks_like_another_family(tmp_path: Path) -> None:
+    """A tag of 6X6_250 on a table; one of 4X4_50, which is tried before, rides on a robot."""
+    flat = np.diag([0.16 / 240, -0.16 / 240, 1.0, 1.0])
+    flat[:3, 3] = [-0.1, 0.1, 0.0]
+    moving, views = tag_texture(3, 60, 10, "4X4_50"), []
+    for number, view in enumerate(cameras("orbit", 30)[::8]):
+        views.append(painted(view, tag_texture(17, name="6X6_250"), flat, tmp_path / f"{number}.png"))
+        picture = cv2.imread(str(views[-1].photo))
+        if number in (1, 2):
+            top, left = (60, 60) if number == 1 else (380, 300)
+            picture[top : top + 80, left : left + 80] = np.rot90(moving, number)[..., None]
+            cv2.imwrite(str(views[-1].photo), picture)
+    found = scale_of_tags(views, 0.16)
+    assert found.metres == pytest.approx(1, rel=0.005) and "1 6X6_250 tags" in found.source
+    for view in views:  # without the one on the table
+        picture = cv2.imread(str(view.photo))
+        picture[180:340] = 128
+        cv2.imwrite(str(view.photo), picture)
+    with pytest.raises(InputError, match=r"4X4_50 tags of 0\.16 m: its corners cannot be triangulated"):
+        scale_of_tags(views, 0.16)
+
+
 def _grey(folder: Path) -> Path:
     cv2.imwrite(str(folder / "grey.png"), np.full((480, 640), 128, np.uint8))
     return folder / "grey.png"
