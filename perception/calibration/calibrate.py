@@ -19,7 +19,7 @@ from perception.io.atomic import write_file
 from perception.map.outputs import check_side_file, refuse_inputs
 from perception.photos.camera_file import camera_data, write_camera
 from perception.photos.decode import orientation, read_grey
-from perception.photos.folder import list_photos
+from perception.photos.folder import list_photos, view_name
 from perception.photos.video import frames
 
 MAX_FRAMES = 240
@@ -93,7 +93,7 @@ def _pictures(source: Path) -> Iterator[tuple[str, np.ndarray]]:
             if orientation(file) != orientation(files[0]):
                 what = f"{file.name} was taken with the camera turned against {files[0].name} (EXIF)"
                 raise InputError(f"{source}: {what}, so its lens lies elsewhere; give photos of one orientation")
-            yield file.name, read_grey(file)
+            yield view_name(file, source), read_grey(file)
     elif source.is_file():
         number = None
         for number, _, frame in frames(source, most=MAX_FRAMES):

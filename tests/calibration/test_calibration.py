@@ -12,7 +12,7 @@ import yaml
 from PIL import Image
 
 from perception.calibration.board import Board, Detection
-from perception.calibration.calibrate import best_model, distinct_views, run_calibration
+from perception.calibration.calibrate import _pictures, best_model, distinct_views, run_calibration
 from perception.calibration.solve import NAMES, project, solve
 from perception.cli import main
 from perception.errors import InputError
@@ -227,6 +227,14 @@ def test_a_board_of_more_markers_than_its_dictionary_has() -> None:
         Board.from_text("charuco:12x9:0.03:0.022:4X4_50")
     with pytest.raises(InputError, match="expected KIND:COLSxROWS"):
         Board.from_text("charuco:10x10:0.03:0.022:4X4_50:0.5")
+
+
+def test_photos_of_one_name_in_two_folders_are_told_apart(tmp_path) -> None:
+    """Their names are the keys of the report's views."""
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        Image.new("L", (60, 40)).save(tmp_path / name / "0.png")
+    assert [name for name, _ in _pictures(tmp_path)] == ["a/0.png", "b/0.png"]
 
 
 def test_what_macs_leave_beside_photos_is_no_photo(tmp_path) -> None:
