@@ -27,6 +27,10 @@ CLOSELY = 0.25
 """How far a lens is trusted: an estimated one replaces it if that makes this many times as many features agree closely,
 within this share of the tolerance: a distortion that is left out moves most features by less than the tolerance."""
 
+USUAL = 0.1, 10.0, 1.0
+"""Least and largest focal length of an estimated lens in long sides of the picture, and largest coefficient of
+distortion, as in COLMAP's mapper: flat things leave all of these open."""
+
 
 @dataclass(frozen=True)
 class Pose:
@@ -105,7 +109,7 @@ def _estimated(matched: Matched, used: np.ndarray, lens: Lens, free: bool) -> Po
     estimation.estimate_focal_length = refinement.refine_focal_length = refinement.refine_extra_params = free
     pixel, point = matched.pixel[used], matched.point[used]
     found = pycolmap.estimate_and_refine_absolute_pose(pixel, point, camera, estimation, refinement)
-    if found is None or not np.isfinite(camera.params).all() or camera.mean_focal_length() <= 0:
+    if found is None or not np.isfinite(camera.params).all() or (free and camera.has_bogus_params(*USUAL)):
         return None
     pose = np.vstack([found["cam_from_world"].matrix(), [0, 0, 0, 1]])
     x = matched.point @ pose[:3, :3].T + pose[:3, 3]

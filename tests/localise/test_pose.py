@@ -97,6 +97,20 @@ def test_a_guessed_lens_is_estimated(focal: float) -> None:
     assert difference(found.camera_from_map, POSE)[0] < 0.1
 
 
+@pytest.mark.parametrize("seed", [0, 1, 4])
+def test_a_flat_thing_and_wrong_matches_give_no_lens_that_does_not_exist(seed: int) -> None:
+    """Seen at a right angle, its distance is as open as the focal length: one wrong match that fits decides on both."""
+    rng = np.random.default_rng(seed)
+    flat = np.c_[rng.uniform(-0.7, 0.7, (30, 2)), np.full(30, 4.0)]
+    pixel = flat[:, :2] / 4 * 1500 + (320, 240) + rng.normal(0, 1, (30, 2))
+    points = np.concatenate([flat, rng.uniform((-1, -1, 3), (1, 1, 5), (60, 3))])
+    pixel = np.concatenate([pixel, rng.uniform(0, 1, (60, 2)) * [640, 480]])
+    guess = Lens("SIMPLE_RADIAL", (768.0, 320.0, 240.0, 0.0), 640, 480)
+    found = find_pose(Matched(np.arange(90), pixel, points), guess, GUESSED, sure)
+    assert isinstance(found, Pose) and 64 <= found.lens.params[0] <= 6400 and abs(found.lens.params[-1]) <= 1
+    assert np.abs(found.camera_from_map[:3, 3]).max() < 20
+
+
 @pytest.mark.parametrize("k", [-0.4, -0.25, 0.0])
 def test_a_pinhole_is_replaced_where_the_photo_is_distorted(k: float) -> None:
     """As raw photos are of a camera whose undistorted ones the map was made from."""
