@@ -124,6 +124,11 @@ def match_task(task: str, progress: Progress = QUIET) -> None:
         with closing(sqlite3.connect(source)) as given, closing(sqlite3.connect(new / DATABASE)) as copy:
             given.backup(copy)
         match(new / DATABASE, facts["pairs"], facts["seed"], progress)
+        with closing(sqlite3.connect(new / DATABASE)) as copy:
+            with copy:
+                for table in _FEATURES:  # 0.3 MB a photo, in the copy of every task
+                    copy.execute(f"DELETE FROM {table}")
+            copy.execute("VACUUM")
 
 
 def _images(database: sqlite3.Connection) -> dict[str, int]:

@@ -18,7 +18,7 @@ from perception.sfm import feature_tasks
 from perception.sfm.database import build_features
 from perception.sfm.options import ReadOptions
 from perception.tasks import engine as engines
-from perception.tasks.folder import TASK, write_task
+from perception.tasks.folder import RESULT, TASK, write_task
 from support.elsewhere import Elsewhere
 
 TABLES = ("cameras", "images", "keypoints", "descriptors", "matches", "two_view_geometries")
@@ -71,7 +71,14 @@ def test_so_is_that_of_a_process_for_each_core(
     monkeypatch.setattr(feature_tasks, "LEAST_PAIRS", 20)
     lenses, wanted, asked = [None] * len(photos), None, []
     run = feature_tasks.run_in_processes
-    monkeypatch.setattr(feature_tasks, "run_in_processes", lambda *a: (asked.append(len(a[1])), run(*a)))
+
+    def ran(task: Any, folders: list[str], *rest: Any) -> None:
+        asked.append(len(folders))
+        run(task, folders, *rest)
+        left = [rows(Path(folder) / RESULT / feature_tasks.DATABASE) for folder in folders]
+        assert not any(tables["descriptors"] for tables in left)  # of all photos, in every folder
+
+    monkeypatch.setattr(feature_tasks, "run_in_processes", ran)
     for number in (1, 3):
         monkeypatch.setattr(feature_tasks, "cores", lambda number=number: number)
         store = build_features(photos, lenses, ReadOptions(tmp_path / str(number), 3))
