@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +74,25 @@ def test_sentences_have_the_same_bits_for_any_number_of_threads() -> None:
         expected = sentences.encode(texts)
     with threadpool_limits(2, "blas"):
         assert np.array_equal(sentences.encode(texts), expected)
+
+
+def test_threads_take_turns_with_the_limit_of_blas(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is the process's: one that overlaps another would restore the other's limit at its end, and keep it."""
+    inside, most = list[int](), list[int]()
+
+    @contextmanager
+    def limits(*_: Any) -> Iterator[None]:
+        inside.append(1)
+        most.append(len(inside))
+        time.sleep(1e-4)  # others get their turn
+        yield
+        inside.pop()
+
+    monkeypatch.setattr("threadpoolctl.threadpool_limits", limits)
+    sentences = MiniLM()
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(sentences.encode, [["mug"]] * 12))
+    assert most == [1] * 12
 
 
 def test_damaged_weights_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
