@@ -153,16 +153,22 @@ class Core:
         try:
             future = self._engine.run(lambda gmap: [self._value(gmap, name) for name in names[:_MOST_NAMES]])
         except (EngineBusy, EngineClosed) as error:
-            done({"values": [self._error_value(error, name) for name in names]})
+            done(self.refusal(error, names))
             return
 
         def finish(ended: Future[list[Message]]) -> None:
             error = ended.exception()
-            values = [self._error_value(error, name) for name in names] if error else ended.result()
+            if error is not None:
+                done(self.refusal(error, names))
+                return
             many = InputError(f"query: {len(names)} names, expected at most {_MOST_NAMES} in one request")
-            done({"values": values + [self._error_value(many, name) for name in names[len(values) :]]})
+            done({"values": [*ended.result(), *self.refusal(many, names[_MOST_NAMES:])["values"]]})
 
         future.add_done_callback(finish)
+
+    def refusal(self, error: BaseException, names: list[str]) -> Message:
+        """The response to a query whose names all have this error."""
+        return {"values": [self._error_value(error, name) for name in names]}
 
     def _value(self, gmap: QueryMap, name: str) -> Message:
         try:
@@ -195,7 +201,7 @@ class Core:
 
     def send_health(self) -> None:
         """Publishes the health message: figures of the engine, counts of rejected prompts, transport warnings."""
-        refused = {f"refused_{kind}": count for kind, count in self._refused.items()}
+        refused = {f"refused_{kind}": count for kind, count in dict(self._refused).items()}  # which grows meanwhile
         dropped = {"images_dropped": self.localising.dropped} if self.localising.dropped else {}
         facts = {**self._engine.health(), **refused, **dropped, **self._transport.figures()}
         body = answers.diagnostics(self._config.namespace, facts, self._transport.warnings(), self._stamps.next())

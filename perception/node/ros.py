@@ -25,10 +25,11 @@ from perception.node.answers import DEPTH, Channel
 from perception.node.config import NodeConfig
 from perception.node.core import Core, Message
 from perception.serve.engine import QueryEngine
+from perception.serve.requests import AnswerTimeout
 
 _SEQUENCE = re.compile(r"(?:sequence<)?(\w+/\w+)(?:, \d+)?>?(?:\[\d+\])?")
 _EXTRA_SECONDS = 1.0
-"""Added to the engine's time-out for a service call; the engine answers or fails before that."""
+"""Added to the engine's time-out for a service call: what has not begun by then fails there with a better reason."""
 
 
 class RosTransport:
@@ -104,9 +105,11 @@ class RosTransport:
             answered.append(values)
             done.set()
 
-        core.query(list(request.names), finish)
-        done.wait(self.config.timeout + _EXTRA_SECONDS)
-        return fill(response, answered[0]) if answered else response
+        names = list(request.names)
+        core.query(names, finish)
+        if not done.wait(self.config.timeout + _EXTRA_SECONDS):
+            finish(core.refusal(AnswerTimeout(f"no answer within {self.config.timeout:g} s"), names))
+        return fill(response, answered[0])
 
 
 def spin(node: Any, config: NodeConfig, stop: threading.Event) -> None:

@@ -6,8 +6,10 @@ import json
 import shutil
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +17,7 @@ import pytest
 
 from perception import load_map
 from perception.errors import InputError
-from perception.node import answers
+from perception.node import answers, ros
 from perception.node.config import NodeConfig, node_config
 from perception.node.core import Core
 from perception.serve.engine import QueryEngine
@@ -155,6 +157,34 @@ def test_health_tells_the_engine_and_the_transport(served: tuple[Core, Heard, Ga
         "3",
         "2",
     )
+
+
+def test_health_is_told_while_refusals_are_counted(served: tuple[Core, Heard, GatedEncoder, QueryEngine]) -> None:
+    core, heard, _, _ = served
+
+    class Growing(Counter[str]):
+        def items(self) -> Any:
+            for pair in super().items():
+                self["from another thread"] += 1
+                yield pair
+
+    core._refused = Growing(bad_input=3)
+    core.send_health()
+    assert {"key": "refused_bad_input", "value": "3"} in heard.messages[-1][1]["status"][0]["values"]
+
+
+def test_a_call_that_takes_too_long_is_answered_with_errors(
+    served: tuple[Core, Heard, GatedEncoder, QueryEngine], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    core, _, encoder, _ = served
+    monkeypatch.setattr(ros, "_EXTRA_SECONDS", 0.0)
+    monkeypatch.setattr(ros, "fill", lambda response, values: response | values)
+    transport = ros.RosTransport(None, NodeConfig(timeout=0.001))
+    names = ["red mug", '{"text": "laptop", "id": "b"}']
+    values = transport._query(core, SimpleNamespace(names=names), {})["values"]
+    encoder.gate.set()
+    told = [json.loads(value["string_value"]) for value in values]
+    assert [(one["id"], one["error"]["kind"]) for one in told] == [(None, "timeout"), ("b", "timeout")]
 
 
 def test_thinned_cloud_of_the_map(tmp_path: Path) -> None:
