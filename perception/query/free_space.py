@@ -49,13 +49,13 @@ class FreeSpace:
     def seen(self, instance_id: int, eyes: np.ndarray, targets: np.ndarray) -> np.ndarray:
         """bool [E, T]: whether the ray from each of eyes [E, 3] to each of targets [T, 3], in the grid's frame, meets
         no voxel with a point of something other than the instance, but for its last 10 cm."""
-        taken = self._taken[self._owners != instance_id]
+        taken = np.append(self._taken[self._owners != instance_id], np.iinfo(np.int64).max)  # which no key is
         rays = targets[None] - eyes[:, None]
         lengths = np.linalg.norm(rays, axis=2)
         steps = int(np.ceil(2 * lengths.max() / CELL)) + 1
         shares = np.linspace(0, 1, steps)[:, None, None] * np.maximum(1 - CLEARANCE / np.maximum(lengths, CLEARANCE), 0)
         keys, within = self._keys(eyes[:, None] + shares[..., None] * rays)
-        return ~(within & (taken[np.searchsorted(taken, keys).clip(max=len(taken) - 1)] == keys)).any(axis=0)
+        return ~(within & (taken[np.searchsorted(taken, keys)] == keys)).any(axis=0)
 
     def _keys(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Numbers of the voxels of points [..., 3] in the grid's frame, int64, and whether each lies above the grid."""

@@ -113,6 +113,10 @@ def test_not_inside_the_box_of_another_instance_but_within_walls_that_are_one() 
     assert gap([ROOM, CRATE], shell[:2]) >= RADIUS
 
 
+def test_nothing_hides_an_instance_that_is_the_whole_map() -> None:
+    assert where_to_stand(room([ROOM, CRATE], merged={0: 1, 1: 1}), 1).seen == 1.0
+
+
 def test_what_hangs_above_the_robot_is_not_in_its_way() -> None:
     """A lamp over the wanted place at 1.9 m leaves it free, at 1.7 m it does not."""
     for height, free in ((1.9, True), (1.7, False)):
