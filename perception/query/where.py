@@ -76,7 +76,7 @@ class Where:
             object.__setattr__(self, "labels", frozenset(tidy(name) for name in names) - {""})
         for name in ("share", "within", "min_size", "max_size"):
             check_length(f"where: {name}", getattr(self, name))
-        if not 0 < self.share <= 1:
+        if not 0 < (self.share or 0) <= 1:
             raise InputError(f"where: share is {self.share}, expected more than 0 and at most 1")
         if self.within is not None and self.near is None:
             raise InputError("where: within needs near, the point or pose it is measured from")

@@ -228,6 +228,7 @@ def test_a_description_names_neighbours_by_their_gap(gmap: QueryMap, arrays: Map
         lambda g: g.nearest([0, 0, 0], 0),
         lambda g: g.find(Where(within=1.0)),
         lambda g: g.find(Where(share=0)),
+        lambda g: g.find(Where(share=None)),
         lambda g: g.find(Where(min_size=-1)),
         lambda g: g.find(Where(max_size="big")),
         lambda g: g.find(Where(labels=[3])),
