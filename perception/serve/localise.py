@@ -112,6 +112,9 @@ def localiser_of(gmap: QueryMap, photos: Path | None) -> Localiser:
         return _made(gmap, photos).result(WAIT)
     except FutureTimeout:
         raise EngineBusy("the map's photos are being read to localise others; ask again in a minute") from None
+    except Exception:
+        _made.cache_clear()  # the next question tries anew: a full disk may have been cleared
+        raise
 
 
 @lru_cache(maxsize=1)

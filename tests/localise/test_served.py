@@ -109,6 +109,20 @@ def test_the_first_question_is_told_to_come_again(folder: Path, monkeypatch: pyt
     served._made.cache_clear()
 
 
+def test_a_failure_to_read_the_photos_is_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any, **__: Any) -> Any:
+        raise InputError("/tmp: its disk has 3 MiB free")
+
+    gmap: Any = object()
+    monkeypatch.setattr(served, "WAIT", 60.0)
+    monkeypatch.setattr(served, "Localiser", full)
+    with pytest.raises(InputError, match="3 MiB"):
+        served.localiser_of(gmap, None)
+    monkeypatch.setattr(served, "Localiser", lambda *_, **__: True)
+    assert served.localiser_of(gmap, None) is True
+    served._made.cache_clear()
+
+
 @pytest.mark.slow
 def test_as_a_tool_with_a_picture_or_a_file_of_an_allowed_folder(engine: QueryEngine, folder: Path) -> None:
     pytest.importorskip("mcp", reason="the extra 'mcp' is not installed")
