@@ -32,7 +32,7 @@ from perception.map.model import NAMES, STORED
 from perception.query.hit import Hit
 from perception.query.query_map import QueryMap
 from perception.query.ranking import Prepared, Scorer, TextEncoder, least_score
-from perception.query.relations import WEIGHT, LevelBoxes, fulfilled, parse
+from perception.query.relations import LevelBoxes, gains_of, parse
 from perception.query.requests import MAX_TOP, TOP, check_prompt
 from perception.query.text_ranking import REMEMBERED, Encoders
 from perception.query.where import Frame, Where, tidy
@@ -178,7 +178,7 @@ class MapStore:
             for own, boxes, names in zip(self._maps.slices, self._maps.boxes, self._maps.names, strict=True)
             if boxes and all(tidy(label or "") != tidy(text) for label in names["labels"])
         ]
-        thing = self.ranker.scores(relation.thing, WEIGHT * fulfilled(self.ranker, maps, relation))
+        thing = self.ranker.scores(relation.thing, *gains_of(self.ranker, maps, relation))
         for own, _ in maps:
             scores[own] = thing[own]
         return scores

@@ -25,6 +25,7 @@ Further rules:
         mean and standard deviation of cos(p, l_i) over the probes p, or over texts that encoders may not understand and
         find all alike (unread.txt), whichever of the two asks for more;   1 if the label equals the prompt
     a prompt of which the encoder knows no word (`Encoder.reads`) has z_ti = the bonuses, and is like no label
+    a label is one of the thing: where a prompt tells it by its place (`relations`) or its print, it counts there only
 
 An instance answers if it scores PRESENT or more and its Φ⁻¹(score / (1 − LAPSE)) is at most BESIDE below the best:
 "chair" has four answers, "red chair" one. All of this is relative to one map. `Prepared` holds what a prompt needs of a
@@ -215,24 +216,26 @@ class Scorer:
         """Scores [I, K] of `shape_words.KINDS`; None if shapes are not available."""
         return None if self._measure_shapes is None else self._measure_shapes()
 
-    def rank(self, prompt: str, gain: np.ndarray | float = 0.0) -> Answer:
-        """Scores every instance for one prompt; see the module docstring. gain: [I], added to z."""
-        scores = self.scores(prompt, gain)
+    def rank(self, prompt: str, gain: np.ndarray | float = 0.0, lack: np.ndarray | float = 0.0) -> Answer:
+        """Scores every instance for one prompt; see the module docstring. gain, lack: of `scores`."""
+        scores = self.scores(prompt, gain, lack)
         hits = [(int(i), float(scores[i])) for i in np.argsort(-scores, kind="stable")]
         return Answer(check_texts([prompt])[0], hits, bool(answering(hits)))
 
-    def scores(self, prompt: str, gain: np.ndarray | float = 0.0) -> np.ndarray:
-        """Scores [I] in [0, 1] of all instances for one prompt. gain: [I], added to z."""
+    def scores(self, prompt: str, gain: np.ndarray | float = 0.0, lack: np.ndarray | float = 0.0) -> np.ndarray:
+        """Scores [I] in [0, 1] of all instances for one prompt. gain: [I], added to z; lack: [I], how much less it is
+        than that of the best one of the map, subtracted from the evidence of labels."""
         text = check_texts([prompt])[0]
         if not len(self.seen):
             return np.zeros(0)
         quoted = quoted_text(text) if self._printed is not None else None
         if quoted is None:
-            return self._scores(text, None, gain)
-        scores = self._scores(*quoted, gain)
+            return self._scores(text, None, gain, lack)
+        scores = self._scores(*quoted, gain, lack)
+        scores[self._named[[name == tidy(text) for name in self._names]]] = 1.0
         if self._reads is None or self._reads.all():
             return scores
-        return np.where(self._reads, scores, self._scores(text, None, gain))
+        return np.where(self._reads, scores, self._scores(text, None, gain, lack))
 
     def similarity(self, texts: Sequence[str]) -> np.ndarray:
         """Cosine of each text's embedding with each instance's [T, I] in [−1, 1], as in the paper; −1 if unseen."""
@@ -242,8 +245,8 @@ class Scorer:
         """Relevancy x of each text for each instance [T, I], without the bonuses and labels."""
         return self.encoder.relevancy(self.encoder.embed(texts), self.prepared.compared)
 
-    def _scores(self, text: str, quoted: str | None, gain: np.ndarray | float) -> np.ndarray:
-        """Scores [I] for a prompt; quoted: what must be printed on the instance; gain: added to z."""
+    def _scores(self, text: str, quoted: str | None, gain: np.ndarray | float, lack: np.ndarray | float) -> np.ndarray:
+        """Scores [I] for a prompt; quoted: what must be printed on the instance; gain, lack: of `scores`."""
         reading, known = self.encoder.reading, self.prepared
         colors = color_words(text.partition(" with ")[0] if reading.colors else text)  # "duck with red hat" is not red
         asked = text if reading.colors else without_color_words(text)
@@ -265,11 +268,12 @@ class Scorer:
             shares = [0.5 - np.minimum(s, 0.5) if w.startswith(NOT) else s for s, w in zip(shares, colors, strict=True)]
             z = z + COLOR_WEIGHT * (match_of_shares(shares) - 0.5)
         a, b = reading.calibration
-        scores = (1 - LAPSE) * normal_cdf(a * z + b) * np.minimum(1.0, QUOTED_LEAST + borne)
+        bears = np.minimum(1.0, QUOTED_LEAST + borne)
+        scores = (1 - LAPSE) * normal_cdf(a * z + b) * bears
         if len(self.encoder.canonical):
             scores = np.minimum(scores, 2 * PRESENT * self._against_canonical(row))
         scores[~self.seen] = 0.0
-        return self._with_labels(scores, text)
+        return self._with_labels(scores, text, bears, np.broadcast_to(lack, len(z)))
 
     def _shape_bonus(self, text: str) -> np.ndarray:
         """Contribution of the instances' shapes to z [I]; 0 if the prompt names no shape and no household thing."""
@@ -292,8 +296,9 @@ class Scorer:
             rival = np.maximum(rival, reading.even)
         return 1.0 / (1.0 + np.exp(reading.scale * (rival - plain @ row[0])))
 
-    def _with_labels(self, scores: np.ndarray, text: str) -> np.ndarray:
-        """Combines image score and label: 1 if the label equals the prompt, else max(score, Φ(z − LABEL_MARGIN))."""
+    def _with_labels(self, scores: np.ndarray, text: str, bears: np.ndarray, lack: np.ndarray) -> np.ndarray:
+        """Combines image score and label: the larger one, where that of a label is 1 if it equals the prompt, else
+        Φ(z − LABEL_MARGIN). bears [I]: factor for what is printed; lack [I]: subtracted from the label's evidence."""
         if not len(self._named):
             return scores
         middle, spread = self.prepared.label_null.T
@@ -301,7 +306,9 @@ class Scorer:
         z = ((fits - middle) / spread).astype(np.float64)
         same = np.array([name == tidy(text) for name in self._names])
         alike = (1 - LAPSE) * normal_cdf(z - LABEL_MARGIN) if self.encoder.reads(text) else 0.0
-        scores[self._named] = np.where(same, 1.0, np.maximum(scores[self._named], alike))
+        of_labels, lack = np.where(same, 1.0, alike), lack[self._named]
+        of_labels = np.where(lack > 0, (1 - LAPSE) * normal_cdf(evidence_of(of_labels) - lack), of_labels)
+        scores[self._named] = np.maximum(scores[self._named], of_labels * bears[self._named])
         return scores
 
 

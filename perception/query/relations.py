@@ -79,8 +79,19 @@ def ranked(ranker: Scorer, boxes: LevelBoxes | None, text: str) -> Answer:
     relation = parse(text)
     if relation is None or boxes is None or quoted_text(text) is not None:
         return ranker.rank(text)
-    gain = WEIGHT * fulfilled(ranker, [(slice(None), boxes)], relation)
-    return replace(ranker.rank(relation.thing, gain), text=" ".join(text.split()))
+    gains = gains_of(ranker, [(slice(None), boxes)], relation)
+    return replace(ranker.rank(relation.thing, *gains), text=" ".join(text.split()))
+
+
+def gains_of(
+    ranker: Scorer, maps: Sequence[tuple[slice, LevelBoxes]], relation: Relation
+) -> tuple[np.ndarray, np.ndarray]:
+    """[I] each: WEIGHT · f, and how much less that is than the most of the own map. maps: as of `fulfilled`."""
+    gain = WEIGHT * fulfilled(ranker, maps, relation)
+    most = gain.copy()
+    for own, _ in maps:
+        most[own] = gain[own].max(initial=0.0)
+    return gain, most - gain
 
 
 def fulfilled(

@@ -9,7 +9,8 @@ import pytest
 
 from perception.language.description import InstanceDescription
 from perception.language.negation import negation_in
-from perception.query.ranking import Ranker
+from perception.language.printed import Printed
+from perception.query.ranking import Ranker, answering
 from perception.query.relations import LevelBoxes, Relation, parse, ranked
 
 
@@ -148,6 +149,30 @@ def test_the_place_decides_between_equals_and_an_absent_other_changes_nothing() 
     plain = ranker.rank("book")
     assert ranked(ranker, places, "book next to the shelf").hits == plain.hits
     assert ranked(ranker, None, "book").hits == plain.hits
+
+
+def test_a_label_names_the_thing_and_not_its_place() -> None:
+    """Two books, both called so by the user: the one next to the lamp answers, unless there is no such lamp."""
+    labels = ["book", "Book", None]
+    ranker = Ranker([thing(5), thing(6), thing(1)], Axes(), labels)
+    lows = np.array([[0.0, 0, 0], [3, 0, 0], [3.5, 0, 0]])
+    places = LevelBoxes(lows, lows + np.array([0.3, 0.3, 0.2]), np.zeros((0, 4, 4)))
+    hits = ranked(ranker, places, "book next to the lamp").hits
+    assert hits[0] == (1, 1.0) and [n for n, _ in answering(hits)] == [1]
+    assert (
+        ranked(ranker, places, "book next to the shelf").hits[:2]
+        == [(0, 1.0), (1, 1.0)]
+        == ranker.rank("book").hits[:2]
+    )
+
+
+def test_a_label_names_the_thing_and_not_its_print() -> None:
+    texts: list[list[dict[str, Any]]] = [[], [{"text": "BIRDS", "score": 0.9}]]
+    ranker = Ranker([thing(0), thing(0)], Axes(), ["book", "book"], printed=Printed(texts))
+    assert [n for n, _ in answering(ranker.rank("book that says BIRDS").hits)] == [1]
+    assert ranker.rank("book").hits == [(0, 1.0), (1, 1.0)]
+    called = Ranker([thing(0), thing(5)], Axes(), [None, 'a book that says "FISH"'], printed=Printed(texts))
+    assert called.rank('A book that says "fish"').hits[0] == (1, 1.0)
 
 
 def test_relations_may_be_chained() -> None:
