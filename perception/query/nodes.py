@@ -59,7 +59,7 @@ class Nodes:
             self._add(kind, True, [[row_of[part["parent"]]] for part in parts])
         if (language := language_in(gmap.groups)) and (gmap.group_ids >= 0).any():
             ids, groups = gmap.group_ids, range(len(gmap.groups["scores"]))
-            centroids = [gmap.means[ids == g].mean(axis=0, dtype=np.float64) for g in groups]
+            centroids = [np.average(gmap.means[ids == g], axis=0, weights=gmap.opacities[ids == g]) for g in groups]
             kind = InstanceSet(gmap, [{"id": g, "score": 1.0, "centroid": centroids[g]} for g in groups], language, ids)
             self._add(kind, False, [np.flatnonzero(gmap.groups["of"] == g).tolist() for g in groups])
 

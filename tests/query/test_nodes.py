@@ -38,6 +38,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     gmap.parts = {"ids": ids, **said("handle", "hollow")}
     of = np.array([-1, -1, 0, 0, -1, -1, -1, -1, -1], np.int32)
     gmap.groups = {"of": of, "scores": np.array([0.7], np.float32), **said("breakfast")}
+    gmap.opacity_logits[:] = 4 * gmap.means[:, 0] - 8  # more to the right
     write_map(path, gmap)
     return path
 
@@ -57,6 +58,8 @@ def test_a_prompt_is_answered_by_the_node_that_it_names(gmap: QueryMap) -> None:
     assert both.instance_id == 5 and both.to_json()["instances"] == [5, 6]
     members = gmap.means[np.isin(gmap.instance_ids, [5, 6])]
     np.testing.assert_array_equal(np.sort(both.points, axis=0), np.sort(members, axis=0))
+    weights = 1 / (1 + np.exp(-gmap.opacity_logits[np.isin(gmap.instance_ids, [5, 6])].astype(np.float64)))
+    np.testing.assert_allclose(both.centroid, weights @ members / weights.sum(), rtol=1e-5)
     assert "part" not in mug.to_json() and "instances" not in mug.to_json()
     assert {hit.instance_id for hit in gmap.query("handle", min_score=0.0)} == set(range(3, 12))  # instances alone
 
