@@ -199,7 +199,7 @@ class Session:
 
     def lit(self) -> list[int]:
         """The highlighted instances: the selected ones, else those of all hits; empty when there are neither."""
-        return self.selected or [hit.instance_id for hit in self.hits]
+        return self.selected or [i for hit in self.hits for i in hit.instances or (hit.instance_id,)]
 
     def opacities(self) -> np.ndarray:
         """[N] float32 opacities; 0 for Gaussians that are not shown."""

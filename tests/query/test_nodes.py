@@ -150,6 +150,8 @@ def test_the_viewer_shows_no_group_of_which_a_member_is_hidden_or_gone(path: Pat
         return [hit.instances for hit in session.ask("breakfast") if hit.instances]
 
     assert groups() == [(5, 6)] and session.selected == [5, 6]
+    session.select(None)  # as a click beside all things does: then the hits are lit
+    assert session.lit() == [5, 6]
     session.editor.hide(6)
     session.edited()
     assert groups() == []
