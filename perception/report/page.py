@@ -250,9 +250,9 @@ def _view_rows(album: _Album) -> list[dict[str, np.ndarray]]:
     """{caption: image} of the held-out views in SHOWN: the photo, the render, their difference."""
     scored = album.scored
     by_psnr = sorted(scored, key=lambda name: float(scored[name]["psnr"]))
-    chosen = dict.fromkeys(by_psnr[i] for i in (0, len(by_psnr) // 2, -1) if by_psnr)
+    places = zip((0, len(by_psnr) // 2, -1), SHOWN, strict=True)
     rows = []
-    for name, rank in zip(chosen, SHOWN, strict=False):
+    for name, rank in {by_psnr[i]: rank for i, rank in places if by_psnr}.items():
         photo = album.photo(name)
         if photo is None:
             continue

@@ -72,3 +72,13 @@ def test_a_spot_half_outside_of_all_photos_is_shown(tmp_path: Path) -> None:
     assert cut is not None
     assert album.spot({**box, "center": [4.97, 1.0, 0.0]}, 0, 0) is not None
     assert album.spot({**box, "center": [5.1, 1.0, 0.0]}, 0, 0) is None
+
+
+def test_of_two_held_out_photos_one_is_the_worst_and_one_the_best(tmp_path: Path) -> None:
+    path = write_visited_map(tmp_path / "a.gsmap")
+    figures = {f"{visit}.jpg": {"psnr": 20.0 + visit, "ssim": 0.5} for visit in range(2)}
+    info = {**read_map(path).info, "quality": {"psnr": 20.5, "ssim": 0.5, "views": figures}}
+    views = [_view(tmp_path, visit, path) for visit in range(2)]
+    rows = page._view_rows(page._Album(Map.of(read_map(path), views=views, info=info)))
+    captions = [next(caption for caption in row if caption.startswith("render")) for row in rows]
+    assert captions == ["render: 20.00 dB, SSIM 0.500, worst of 2", "render: 21.00 dB, SSIM 0.500, best of 2"]
