@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.documents import refusing
 from perception.language.base import Reading, check_images, check_texts, unit_rows
 from perception.language.preprocess import CLIP_FAMILY, Family, family_of, find_preprocess
 from perception.language.tokenizer import Tokenizer, find_tokenizer
@@ -110,14 +111,15 @@ class ClipEncoder:
     @classmethod
     def from_spec(cls, argument: str) -> ClipEncoder:
         """From "IMAGE.onnx,TEXT.onnx", "BOTH.onnx", a folder with files of the usual names, or a stored model name."""
-        argument = resolve(argument)
-        parts = [Path(part.strip()).expanduser() for part in argument.split(",")]
-        if len(parts) == 2:
-            return cls(parts[0], parts[1])
-        if len(parts) == 1 and parts[0].is_dir():
-            return cls(*_find_pair(parts[0]))
-        if len(parts) == 1 and parts[0].suffix == ".onnx":
-            return cls(parts[0], parts[0])
+        with refusing(f"clip:{argument}: a file beside the model is not understood ({{why}}); fetch it again"):
+            argument = resolve(argument)
+            parts = [Path(part.strip()).expanduser() for part in argument.split(",")]
+            if len(parts) == 2:
+                return cls(parts[0], parts[1])
+            if len(parts) == 1 and parts[0].is_dir():
+                return cls(*_find_pair(parts[0]))
+            if len(parts) == 1 and parts[0].suffix == ".onnx":
+                return cls(parts[0], parts[0])
         raise InputError(
             f"clip:{argument}: expected IMAGE.onnx,TEXT.onnx, a folder that exists, or a stored model; {known_names()}"
         )

@@ -389,6 +389,27 @@ def test_bad_models_are_told_in_one_line(clip_folder: tuple[Path, Any], tmp_path
         ClipEncoder(narrow, text)
 
 
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("config.json", {"vision_cfg": [1]}),
+        ("config.json", {"text_config": 77}),
+        ("open_clip_config.json", {"model_cfg": None}),
+        ("preprocessor_config.json", {"size": {"height": None, "width": 224}}),
+        ("preprocessor_config.json", {**CLIP_PREPROCESSOR, "image_mean": ["a", 0, 0]}),
+    ],
+)
+def test_a_damaged_file_beside_the_model_is_told_in_one_line(
+    clip_folder: tuple[Path, Any], tmp_path: Path, name: str, content: dict[str, Any]
+) -> None:
+    for file in clip_folder[0].iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    (tmp_path / name).write_text(json.dumps(content))
+    with pytest.raises(InputError, match=f"clip:{tmp_path}: a file beside the model is not understood") as error:
+        make_encoder(f"clip:{tmp_path}")
+    assert "\n" not in str(error.value)
+
+
 def test_a_silent_fall_back_from_cuda_is_told(clip_folder: tuple[Path, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     names = ["CUDAExecutionProvider", "CPUExecutionProvider"]
     monkeypatch.setattr("onnxruntime.get_available_providers", lambda: names)
