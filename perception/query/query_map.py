@@ -67,7 +67,7 @@ class QueryMap(Map):
 
     def __post_init__(self) -> None:
         self._at = lru_cache(_VIEWS)(lambda visit: self._scene(visit, lambda entry: stood(entry, visit)))
-        self._visit = self.newest_visit
+        self._visit, self._today = self.newest_visit, self
         self._record: Map | None = None
         if any(map(is_removed, self.instances)):
             self._record = Map.of(self)
@@ -261,7 +261,7 @@ class QueryMap(Map):
         fields = scene(self.record, spot_of)
         index = fields.pop("index")
         then = QueryMap.of(self, **fields, encoders=self.encoders)
-        vars(then).update(index=index, _record=self.record, _visit=visit)
+        vars(then).update(index=index, _record=self.record, _visit=visit, _today=self._today)
         return then
 
     # ------------------------------------------------------------------ one instance
@@ -353,7 +353,7 @@ class QueryMap(Map):
         """Where a robot can be (`robot_pose.where_to_stand`); InputError as `floor_grid`."""
         from perception.query.free_space import FreeSpace
 
-        return FreeSpace(self)
+        return FreeSpace(self) if self._today is self else self._today.free_space
 
     @cached_property
     def _spatial(self) -> SpatialIndex:

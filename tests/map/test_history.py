@@ -103,6 +103,13 @@ def test_a_name_of_a_gone_thing_is_known_without_any_encoder(
         opened.query("cup")
 
 
+def test_the_free_space_is_todays_as_of_every_visit(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("perception.query.free_space.FreeSpace", lambda gmap: (gmap, len(gmap.instances)))
+    today = load_map(path, encoders)
+    for then in (today.at(0), today.at(1), today.at(0).at(1), today.last_known):
+        assert then.free_space == (today, len(STOOD[2]) + 1)  # and the shelf
+
+
 @pytest.mark.parametrize("name", [name for name in STATES if name != "mug"])
 def test_a_hit_has_its_state_and_where_it_was(gmap: QueryMap, name: str) -> None:
     hit = gmap.query(name)[0]
