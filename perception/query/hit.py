@@ -25,7 +25,7 @@ class _Points:
         hit.__dict__["_points"] = points
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Hit:
     """One instance in the result of a query.
 
@@ -159,7 +159,7 @@ def printed_texts(entry: dict[str, Any]) -> list[str]:
     return [f'"{text["text"]}"' for text in entry.get("texts", [])]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Description:
     """All properties of one instance. confidence: the mapper's score in [0, 1]; aabb: [2, 3] lowest and highest corner
     in the frame of `hit`; colors: names of its main colours with their shares, largest first.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from copy import deepcopy
 from dataclasses import replace
 from functools import cache, cached_property, partial
 from typing import Any
@@ -72,7 +73,7 @@ class InstanceSet:
             float(entry["score"]) if score is None else score,
             self.index.of(number),
             np.array(entry["centroid"], np.float64),
-            self._box(row),
+            deepcopy(self._box(row)),  # the caller may write into it
             entry.get("label"),
             self.views(row),
             self._covariance(row),

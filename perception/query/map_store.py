@@ -184,7 +184,7 @@ class MapStore:
         return scores
 
     def _hit(self, position: int, score: float) -> Hit:
-        record, n = self._maps.records[position], int(self._maps.owner[position])
+        record, n = self._maps.records[position].copy(), int(self._maps.owner[position])  # it may be written into
         entry, row = self.maps[n], position - self._maps.slices[n].start
         number = int(record["id"])
         return Hit(

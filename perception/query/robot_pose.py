@@ -19,7 +19,7 @@ LEAST_SEEN = 0.5  # share of the rays that make a line of sight
 SIDEWAYS = 0.25  # metres off the wanted distance that weigh as much as one metre off the instance's centre
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RobotPose:
     """A pose on the floor beside an instance. position [3] and map_from_robot [4, 4], rigid, in `frame`; the robot's
     frame is that of REP 103: origin on the floor below its centre, x forward to the instance, z up.

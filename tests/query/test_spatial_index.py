@@ -60,6 +60,16 @@ def test_hits_are_the_gaussians_of_their_instance(gmap: QueryMap, arrays: Map) -
     assert 0 < sum(bool(gmap.query(f"nothing {n}")) for n in range(100)) < 40
 
 
+def test_a_hit_belongs_to_its_caller(gmap: QueryMap) -> None:
+    """What is written into it changes no other answer; and hits are told apart, also those of one instance."""
+    first, before = gmap.get(4), gmap.get(4).to_json()
+    for array in (first.centroid, first.obb.center, first.obb.rotation, first.obb.extent):
+        array += 1
+    assert gmap.get(4).to_json() == before != first.to_json()
+    assert gmap.get(4) not in [first] and len({first, gmap.get(4)}) == 2
+    assert gmap.describe(4) != gmap.describe(4)
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_nearest_agrees_with_brute_force(gmap: QueryMap, arrays: Map, seed: int) -> None:
     point = np.random.default_rng(seed).uniform(-2, 5, 3)

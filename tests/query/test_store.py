@@ -269,6 +269,14 @@ def test_without_the_maps_folder_all_but_points_is_answered(maps: list[Path], tm
         _ = hits[0].points
 
 
+def test_what_is_written_into_a_hit_changes_no_other_answer(store: Path) -> None:
+    opened = load_map(store, encoders)
+    first, before = opened.query("mug", 1, 0.0)[0], opened.query("mug", 1, 0.0)[0].to_json()
+    for array in (first.centroid, first.covariance, first.obb.center, first.obb.extent):
+        array += 1
+    assert opened.query("mug", 1, 0.0)[0].to_json() == before != first.to_json()
+
+
 def test_a_hit_in_a_frame_with_another_unit_is_not_metric(store: Path) -> None:
     hits = load_map(store, encoders).query("mug", min_score=0.0)
     assert {hit.metric for hit in hits} == {True, False}
