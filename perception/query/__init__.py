@@ -9,13 +9,4 @@ from perception.query.map_store import load_map
 from perception.query.query_map import QueryMap
 from perception.query.where import Frame, Where, axis_box
 
-__all__ = [
-    "Description",
-    "Frame",
-    "Hit",
-    "Neighbor",
-    "QueryMap",
-    "Where",
-    "axis_box",
-    "load_map",
-]
+__all__ = ["Description", "Frame", "Hit", "Neighbor", "QueryMap", "Where", "axis_box", "load_map"]

@@ -86,20 +86,17 @@ class InstanceSet:
         """Names of the views that show the entry best, best first."""
         if not self.language:
             return ()
-        stop = int(self._view_stops[row])
-        names = self.language["view_names"][stop - int(self.language["view_counts"][row]) : stop]
-        return tuple(str(name) for name in names)
+        return tuple(self.language["view_names"][self._views_of(row)].tolist())
 
     def best_box(self, row: int) -> tuple[int, int, int, int]:
         """The box x0, y0, x1, y1 of the entry in the first of its `views`, pixels of the size used for training."""
-        start = int(self._view_stops[row]) - int(self.language["view_counts"][row])
-        x0, y0, x1, y1 = (int(value) for value in self.language["view_boxes"][start])
+        x0, y0, x1, y1 = self.language["view_boxes"][self._views_of(row).start].tolist()
         return x0, y0, x1, y1
 
-    @cached_property
-    def _view_stops(self) -> np.ndarray:
-        """[I] int64: one past the last row of each entry's views."""
-        return np.cumsum(self.language["view_counts"], dtype=np.int64)
+    def _views_of(self, row: int) -> slice:
+        """The rows of the entry's views."""
+        start = int(self.language["view_counts"][:row].sum())
+        return slice(start, start + int(self.language["view_counts"][row]))
 
     def _recorded_box(self, row: int) -> OrientedBox:
         """The entry's box; of a group, which has none on record, that around its points."""

@@ -98,15 +98,7 @@ class MapStore:
     def counts(self) -> dict[str, int]:
         return {"maps": len(self.maps), "instances": len(self._maps.records)}
 
-    @property
-    def problem(self) -> str | None:
-        """As `QueryMap.problem`."""
-        try:
-            _ = self.ranker
-        except InputError as error:
-            return str(error)
-        return None
-
+    problem: Any = QueryMap.problem
     visits = ()
 
     def visits_json(self) -> dict[str, Any]:
@@ -134,9 +126,8 @@ class MapStore:
         `min_score`: all with this score instead. Raises InputError as `QueryMap.query`, and for `where` and `frame`."""
         check_prompt(text, top_k, min_score)
         if where is not None or frame is not None:
-            raise InputError(
-                f"{self.path}: is a store, whose maps have their own frames; give where and frame to a map"
-            )
+            what = "is a store, whose maps have their own frames"
+            raise InputError(f"{self.path}: {what}; give where and frame to a map")
         return [self._hit(n, score) for n, score in self._chosen(text, min_score)[:top_k]]
 
     @cached_property

@@ -6,6 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from perception.language.household import class_names
 from perception.language.shape_words import HINTS, KINDS
 from perception.query.ranking import Ranker
 
@@ -24,19 +25,14 @@ def likely_names(ranker: Ranker, count: int = 3) -> list[list[str]]:
     shapes = ranker.shapes
     names: list[list[str]] = []
     for i, row in enumerate(relevancy.T):
-        if not ranker.seen[i]:
-            names.append([])
-            continue
         ranked = [nouns[n] for n in np.argsort(-row, kind="stable")[: count + 1]]
         if shapes is not None:
             ranked = [kind for k, kind in enumerate(KINDS) if kind not in HINTS and shapes[i, k] >= SURE] + ranked
-        names.append(list(dict.fromkeys(ranked))[:count])
+        names.append(list(dict.fromkeys(ranked))[:count] if ranker.seen[i] else [])
     return names
 
 
 @lru_cache(maxsize=1)
 def vocabulary() -> list[str]:
     """The first name of every ImageNet class, and common words where the class names are too specific."""
-    from perception.language.household import class_names
-
     return list(dict.fromkeys([group[0] for group in class_names()] + list(PLAIN_WORDS)))

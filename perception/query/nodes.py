@@ -90,11 +90,8 @@ class Nodes:
             if node.is_part and wholes:
                 continue
             clear = score[n] >= PRESENT and z[n] >= CLEAR + max(z[i] for i in node.rows)
-            if clear and self._fulfils(node, where):
+            labelled = all(self._wholes.has_label(i, where.labels) for i in node.rows)
+            if clear and labelled and node.kind.fulfils(node.row, replace(where, labels=None)):
                 chosen.append((node, score[n]))
                 replaced.update(node.rows)
         return sorted([*chosen, *(hit for hit in hits if hit[0] not in replaced)], key=lambda hit: -hit[1])
-
-    def _fulfils(self, node: Node, where: Where) -> bool:
-        labelled = all(self._wholes.has_label(n, where.labels) for n in node.rows)
-        return labelled and node.kind.fulfils(node.row, replace(where, labels=None))

@@ -13,6 +13,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.geometry import move_points, scale_of
+from perception.language.colors import COLOR_NAMES, color_share
 from perception.map.history import Visit, changes_of, is_removed, last_seen, left, stood, visit_number, visits_of
 from perception.map.map import InstanceIndex, Map, build_index
 from perception.query.hit import Description, Hit, Neighbor
@@ -22,17 +23,8 @@ from perception.query.nodes import Candidate, Node, Nodes
 from perception.query.past import Spot, present, scene
 from perception.query.ranking import Ranker, answering
 from perception.query.requests import MAX_TOP, TOP, UnknownInstance, check_prompt
-from perception.query.spatial_index import SpatialIndex
 from perception.query.text_ranking import Encoders, TextRanking
-from perception.query.where import (
-    Frame,
-    Where,
-    check_box,
-    check_frame,
-    check_length,
-    position_of,
-    wanted_in_map,
-)
+from perception.query.where import Frame, Where, check_box, check_frame, check_length, position_of, wanted_in_map
 from perception.types import DepthImage, Lens, OrientedBox, View
 
 if TYPE_CHECKING:
@@ -99,7 +91,7 @@ class QueryMap(Map):
 
     def warm(self) -> None:
         """Prepares what the first queries need: spatial index, shape scores, text encoder."""
-        _ = self._spatial
+        _ = self._wholes.spatial
         if self.problem is None and self.instances:
             _ = self.ranker.shapes
             self.query("thing")
@@ -153,7 +145,7 @@ class QueryMap(Map):
         wanted = wanted_in_map(where, frame)
         point = _in_map(near, frame)
         ids = [int(self.instances[n]["id"]) for n in self._fulfilling(wanted)]
-        nearest = self._spatial.nearest(point, top_k, ids)
+        nearest = self._wholes.spatial.nearest(point, top_k, ids)
         return [_in(frame, replace(self.hit(self.position(i)), distance=distance)) for distance, i in nearest]
 
     def instance_at(
@@ -165,7 +157,7 @@ class QueryMap(Map):
         for hit in self.nearest(point, 1, frame=frame):
             if max_distance is not None and hit.distance is not None:
                 return hit if hit.distance <= max_distance else None
-            return hit if self._spatial.reaches(hit.instance_id, _in_map(point, frame)) else None
+            return hit if self._wholes.spatial.reaches(hit.instance_id, _in_map(point, frame)) else None
         return None
 
     def get(self, instance_id: int, *, frame: Frame | None = None) -> Hit:
@@ -177,7 +169,7 @@ class QueryMap(Map):
         position = self.position(instance_id)
         hit = _in(frame, self.hit(position))
         scale = 1.0 if frame is None else scale_of(frame.from_map)
-        beside = self._spatial.neighbors(instance_id, _NEIGHBORS)
+        beside = self._wholes.spatial.neighbors(instance_id, _NEIGHBORS)
         labels = {entry["id"]: entry.get("label") for entry in self.instances}
         bounds = np.array([hit.points.min(axis=0), hit.points.max(axis=0)] if len(hit.points) else np.full((2, 3), 0.0))
         return Description(
@@ -323,8 +315,6 @@ class QueryMap(Map):
         palettes = self.language.get("palettes")
         if palettes is None:
             return ()
-        from perception.language.colors import COLOR_NAMES, color_share
-
         shares = [(name, float(color_share(palettes[position : position + 1], name)[0])) for name in COLOR_NAMES]
         return tuple(sorted((entry for entry in shares if entry[1] >= _LEAST_COLOR), key=lambda entry: -entry[1]))
 
@@ -354,10 +344,6 @@ class QueryMap(Map):
         from perception.query.free_space import FreeSpace
 
         return FreeSpace(self) if self._today is self else self._today.free_space
-
-    @cached_property
-    def _spatial(self) -> SpatialIndex:
-        return self._wholes.spatial
 
 
 def _in(frame: Frame | None, hit: Hit) -> Hit:

@@ -9,9 +9,12 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from perception.errors import InputError
+from perception.frame.gravity import Gravity
 from perception.language.base import Encoder
+from perception.language.description import check_encoder, from_arrays
 from perception.language.encoders import make_encoder
 from perception.language.printed import Printed
+from perception.language.shapes import plane_normal, shape_scores
 from perception.machine import torch_on_one_thread
 from perception.map.map import Map
 from perception.query.ranking import Answer, Ranker
@@ -73,8 +76,6 @@ class TextRanking:
             return self._made
 
     def _make(self) -> Ranker:
-        from perception.language.description import check_encoder, from_arrays
-
         if not self._gmap.language:
             raise InputError(
                 f"{self._gmap.path}: holds no language embeddings; map again with an encoder (language.encoder=…)"
@@ -94,9 +95,6 @@ class TextRanking:
         return LevelBoxes.of(self._gmap)
 
     def _shapes(self) -> np.ndarray:
-        from perception.frame.gravity import Gravity
-        from perception.language.shapes import shape_scores
-
         index = self._gmap.index
         owners = np.repeat(index.ids, np.diff(index.starts))
         poses = self._gmap.poses
@@ -123,8 +121,6 @@ def extents(gmap: Map) -> np.ndarray:
     """[I, 3] sides of the instances along the axes of their boxes, or thinner: along the normal of their best plane;
     without the outer TRIM of the points at either end, which stray in a map, and scaled as if spread evenly.
     """
-    from perception.language.shapes import plane_normal
-
     sides = np.zeros((len(gmap.instances), 3))
     for n, entry in enumerate(gmap.instances):
         points = gmap.index.of(entry["id"]).astype(np.float64)

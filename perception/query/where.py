@@ -86,11 +86,8 @@ class Where:
         if frame is None:
             return self
         scale = scale_of(frame.to_map)
-        moved: dict[str, Any] = {
-            name: value * scale
-            for name in ("within", "min_size", "max_size")
-            if (value := getattr(self, name)) is not None
-        }
+        lengths = {name: getattr(self, name) for name in ("within", "min_size", "max_size")}
+        moved: dict[str, Any] = {name: scale * value for name, value in lengths.items() if value is not None}
         if self.region is not None:
             moved["region"] = move_box(frame.to_map, self.region)
         if self.near is not None:

@@ -62,11 +62,7 @@ class QueryEngine:
     """
 
     def __init__(
-        self,
-        path: str | Path,
-        *,
-        encoders: Callable[[str], Encoder | None] | None = None,
-        **settings: Any,
+        self, path: str | Path, *, encoders: Callable[[str], Encoder | None] | None = None, **settings: Any
     ) -> None:
         """settings: the fields of `EngineSettings`; InputError when one is unknown or out of range, or for a folder
         that is no map."""
@@ -109,8 +105,6 @@ class QueryEngine:
     def run(self, work: Callable[[QueryMap], T], timeout: float | None = None, map_id: str | None = None) -> Future[T]:
         """Queues `work`, which a worker thread calls with the current map. EngineBusy when the queue is full. The
         future raises OtherMap when `map_id` is given and is not the id of the map."""
-        if self._closed.is_set():
-            raise EngineClosed(f"{self.path}: the engine has been closed")
 
         def checked(gmap: QueryMap) -> T:
             if map_id is not None and map_id != gmap.map_id:

@@ -31,14 +31,7 @@ from perception.query.hit import printed_texts
 from perception.query.requests import MAX_TOP
 from perception.query.robot_pose import where_to_stand
 from perception.query.scene_graph import scene_graph
-from perception.serve.answers import (
-    Answer,
-    ChangesAnswer,
-    DescribeAnswer,
-    InstancesAnswer,
-    MeasureAnswer,
-    PoseAnswer,
-)
+from perception.serve.answers import Answer, ChangesAnswer, DescribeAnswer, InstancesAnswer, MeasureAnswer, PoseAnswer
 from perception.serve.bodies import AnyRegion, Body, FrameBody, Length, PointOrPose, Prompt, Text, Visit, parse
 from perception.serve.engine import QueryEngine
 from perception.serve.localise import GivenPhoto, Place

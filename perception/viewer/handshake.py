@@ -13,7 +13,6 @@ import io
 import re
 import socket
 import threading
-from collections.abc import Callable, Iterator
 from http import HTTPStatus
 from typing import Any
 from urllib.parse import parse_qs, quote, unquote
@@ -49,7 +48,8 @@ def refusal(guard: Guard, request: Any) -> Any:
     if shown and guard.trusts(shown[0]):
         kept = f"{cookie}={quote(shown[0], safe='')}; HttpOnly; SameSite=Lax; Path=/"
         return _answer(HTTPStatus.SEE_OTHER, "", {"Location": "/", "Set-Cookie": kept})
-    if not any(guard.trusts(value) for value in _cookies(request, cookie)):
+    sent = [pair.strip().partition("=") for header in request.headers.get_all("Cookie") for pair in header.split(";")]
+    if not any(guard.trusts(unquote(value)) for name, _, value in sent if name == cookie):
         return _answer(HTTPStatus.FORBIDDEN, "open the address with the token that perception view printed")
     if query:
         # viser's page connects to any server given by ?websocket=… and executes the messages from there.
@@ -61,14 +61,6 @@ def _only(request: Any, name: str) -> str | None:
     """The value of a header that occurs exactly once, else None."""
     values = request.headers.get_all(name)
     return values[0] if len(values) == 1 else None
-
-
-def _cookies(request: Any, name: str) -> Iterator[str]:
-    for header in request.headers.get_all("Cookie"):
-        for pair in header.split(";"):
-            key, _, value = pair.strip().partition("=")
-            if key == name:
-                yield unquote(value)
 
 
 def _answer(status: HTTPStatus, line: str, headers: dict[str, str] | None = None) -> Any:
@@ -95,7 +87,15 @@ def guarded_server(guard: Guard, sock: socket.socket, **settings: Any) -> Any:
     @functools.wraps(original)
     def serve(handler: Any, host: Any, port: Any, *, process_request: Any = None, **rest: Any) -> Any:
         seen.set()
-        check = _process_request(guard, process_request)
+
+        def check(connection: Any, request: Any) -> Any:
+            answer = refusal(guard, request)
+            if answer is None and process_request is not None:
+                answer = process_request(connection, request)
+            for name, value in _HEADERS.items() if answer is not None else ():
+                answer.headers[name] = value.format(host=_only(request, "Host") or "")
+            return answer
+
         return original(handler, None, None, sock=sock, process_request=check, **rest)
 
     with _patching, contextlib.redirect_stdout(io.StringIO()):  # viser prints on stdout, which is reserved for --json
@@ -108,17 +108,3 @@ def guarded_server(guard: Guard, sock: socket.socket, **settings: Any) -> Any:
             server.stop()
             raise InputError(f"viser {viser.__version__}: its server cannot be guarded; install viser 1.1")
     return server
-
-
-def _process_request(guard: Guard, inner: Callable[[Any, Any], Any] | None) -> Callable[[Any, Any], Any]:
-    def process_request(connection: Any, request: Any) -> Any:
-        answer = refusal(guard, request)
-        if answer is None and inner is not None:
-            answer = inner(connection, request)
-        if answer is not None:
-            host = _only(request, "Host") or ""
-            for name, value in _HEADERS.items():
-                answer.headers[name] = value.format(host=host)
-        return answer
-
-    return process_request

@@ -89,15 +89,9 @@ class Session:
 
     def select(self, instance: int | None, add: bool = False) -> None:
         """Selects an instance, or with `add` toggles it in the selection. None clears the selection, unless `add`."""
+        before, clicked = self.selected if add else [], [] if instance is None else [instance]
+        self.selected = [i for i in before if i != instance] + [i for i in clicked if i not in before]
         self.part = None
-        if instance is None:
-            self.selected = self.selected if add else []
-        elif not add:
-            self.selected = [instance]
-        elif instance in self.selected:
-            self.selected = [i for i in self.selected if i != instance]
-        else:
-            self.selected = [*self.selected, instance]
 
     def clear(self) -> None:
         """Clears the question, its hits and the selection."""
