@@ -124,15 +124,20 @@ class Core:
                 future.add_done_callback(lambda done, question=question: self._answer(question, done))  # type: ignore[misc]
 
     def _answer(self, question: Question, done: Future[Reply]) -> None:
-        error = done.exception()
-        if error is not None:
+        try:
+            reply, stamp = done.result(), self._stamps.next()
+            parts = {
+                answers.POINTS: answers.hits_cloud(reply, stamp),
+                answers.BOXES: answers.hits_detections(reply, stamp),
+                answers.MARKS: answers.hits_markers(reply, question.identity, stamp),
+            }
+            told = {**answers.answer_json(reply, question.identity), "stamp": answers.stamp_json(stamp)}
+        except Exception as error:  # of the engine, or of a box that is none: all four messages are sent, or this
             self._send_error(error, question.request.text, question.identity)
             return
-        reply, stamp, send = done.result(), self._stamps.next(), self._transport.publish
-        send(answers.POINTS, answers.hits_cloud(reply, stamp))
-        send(answers.BOXES, answers.hits_detections(reply, stamp))
-        send(answers.MARKS, answers.hits_markers(reply, question.identity, stamp))
-        self._send_json({**answers.answer_json(reply, question.identity), "stamp": answers.stamp_json(stamp)})
+        for topic, message in parts.items():
+            self._transport.publish(topic, message)
+        self._send_json(told)
 
     def _send_error(self, error: BaseException, text: str, identity: str | None) -> None:
         body = error_json(error, text, identity)

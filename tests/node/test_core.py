@@ -173,6 +173,18 @@ def test_health_is_told_while_refusals_are_counted(served: tuple[Core, Heard, Ga
     assert {"key": "refused_bad_input", "value": "3"} in heard.messages[-1][1]["status"][0]["values"]
 
 
+def test_a_map_whose_box_is_none_answers_with_an_error(tmp_path: Path) -> None:
+    path, heard = tmp_path / "a.gsmap", Heard()
+    write_small_map(path, ["red mug"])
+    entries = json.loads((path / "instances.json").read_text())
+    entries["instances"][0]["obb"]["rotation"][2] = [0, 0, -1]  # a mirror
+    (path / "instances.json").write_text(json.dumps(entries))
+    with QueryEngine(path, watch=None, encoders=lambda _: WordEncoder()) as engine:
+        Core(engine, heard, NodeConfig()).prompt('{"text": "red mug", "id": "a"}')
+        (told,) = heard.answers(1)
+    assert (told["id"], told["error"]["kind"], len(heard.messages)) == ("a", "failed", 1)
+
+
 def test_a_call_that_takes_too_long_is_answered_with_errors(
     served: tuple[Core, Heard, GatedEncoder, QueryEngine], monkeypatch: pytest.MonkeyPatch
 ) -> None:
