@@ -78,10 +78,12 @@ def floor_grid(gmap: Map, resolution: float, step: float = STEP) -> tuple[np.nda
     within `step` of it; else unknown. What lies deeper is not drawn: a stair down is unknown.
 
     "Something" is a point of `level_surface`; discs with a radius above two cells leave gaps. InputError for a map
-    without metric scale, gravity, cameras or floor, or of more than 16 million cells.
+    without metric scale, gravity, cameras or floor, of more than 16 million cells, or of cells without a size.
 
     >>> cells, map_from_grid = floor_grid(perception.load_map("room.gsmap"), 0.1)
     >>> sorted({int(value) for value in cells.ravel()}), map_from_grid.shape  # unknown, free, occupied
     ([-1, 0, 100], (4, 4))
     """
+    if not 0 < resolution < np.inf:
+        raise InputError(f"floor_grid: resolution is {resolution}, expected a positive number of metres")
     return level_surface(gmap).grid(resolution, step)

@@ -109,3 +109,9 @@ def test_maps_without_a_floor_plan_say_why(info: dict[str, Any], words: str) -> 
         floor_grid(room(np.eye(4), **info), CELL)
     with pytest.raises(InputError, match="more than"):
         floor_grid(room(np.eye(4)), 1e-4)
+
+
+@pytest.mark.parametrize("resolution", [0.0, -0.05, np.nan, np.inf])
+def test_cells_have_a_size(resolution: float) -> None:
+    with pytest.raises(InputError, match="expected a positive number of metres"):
+        floor_grid(room(np.eye(4)), resolution)
