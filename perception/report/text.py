@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perception.errors import shell_word
+from perception.errors import shell_word, visible
 from perception.map.checksums import IGNORED
 from perception.map.history import STATES, Visit, changes_of, date_of, is_removed, visits_of
 
@@ -78,7 +78,7 @@ def info_text(path: Path, info: dict[str, Any], entries: Sequence[dict[str, Any]
     if printed := [e for e in entries if e.get("texts")]:
         from perception.query.hit import printed_texts
 
-        lines += [f"printed on {e['id']}: {', '.join(printed_texts(e))}" for e in printed]
+        lines += [f"printed on {e['id']}: {visible(', '.join(printed_texts(e)))}" for e in printed]
     lines += [f"decision: {text}" for text in training.get("decisions", [])]
     return "\n".join([*lines, *left_out, *warnings])
 
@@ -167,7 +167,7 @@ def names_of(opened: QueryMap) -> dict[int, str]:
 
 
 def _name(instance_id: int, label: str | None, names: Mapping[int, str]) -> str:
-    return label or names.get(instance_id, "no name")
+    return visible(label or names.get(instance_id, "no name"))
 
 
 def _position(point: Sequence[float] | np.ndarray, metric: bool | None) -> str:

@@ -43,6 +43,15 @@ def test_answers_stand_in_columns_with_their_names_and_units() -> None:
     assert "cm" not in query_text([("mug", hits, [])], False)  # without a scale no unit is claimed
 
 
+def test_labels_and_prints_of_a_map_from_others_cannot_write_into_the_terminal() -> None:
+    evil = "red\x1b[2J\nmug"
+    lines = query_text([("mug", [hit_of(3, 1.0, evil)], [])], True).splitlines()
+    assert len(lines) == 2 and "red\\x1b[2J\\nmug" in lines[1]
+    info: dict[str, Any] = {"num_gaussians": 1, "num_instances": 1, "sh_degree": 1}
+    told = info_text(Path("k.gsmap"), info, [{"id": 0, "texts": [{"text": evil, "score": 0.9}]}])
+    assert 'printed on 0: "red\\x1b[2J\\nmug"' in told.splitlines()
+
+
 def test_the_first_three_lines_of_info_are_what_how_good_and_what_next() -> None:
     info: dict[str, Any] = {
         "num_gaussians": 12345,
