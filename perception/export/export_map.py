@@ -21,7 +21,7 @@ from perception.export.spz import write_spz
 from perception.frame.recentre import map_from_input
 from perception.geometry import check_similarity, move_points, scale_of
 from perception.io.atomic import write_file
-from perception.io.cloud import read_cloud, storable, write_cloud
+from perception.io.cloud import left_out, read_cloud, write_cloud
 from perception.io.documents import refusing
 from perception.map.history import is_removed
 from perception.map.write import Map, read_map
@@ -174,9 +174,7 @@ def export_map(
     inside = check_overlap(means, cloud.points)
     if color == "instance":
         cloud = replace(cloud, colors=instance_palette(labels))
-    others = storable(cloud.labels)[1] if output.suffix.lower() != ".npz" else []
-    others += ["faces"] if output.suffix.lower() == ".pcd" and cloud.faces is not None else []
-    if others:
+    if others := left_out(output, cloud):
         facts["left_out"] = others
     sidecar = write_export(output, cloud, labels, instances, facts)  # last: where it is, everything was written
     result = {

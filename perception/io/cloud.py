@@ -26,6 +26,8 @@ _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_g
 _NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 _WRITTEN = {*"xyz", *_COLORS[0], *_NORMALS[0], *_NORMALS[1], "rgb"}
 """Names of columns that hold the points, colours and normals of files that are written."""
+_NPZ_OWN = {"points", "colors", "normals", "faces", "file", "allow_pickle"}
+"""Names of the arrays of a cloud in an .npz, and what `np.savez` takes for options."""
 _EXACT = 2**53
 """Whole numbers up to this are exact as doubles."""
 _ASIDE = 0.95
@@ -102,7 +104,7 @@ def storable(labels: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], list
         if kind.kind == "b":
             kind = np.uint8
         elif kind.kind == "f":
-            kind = np.promote_types(kind, np.float32)
+            kind = np.float64 if kind.itemsize > 4 else np.float32
         elif kind.itemsize == 8:
             most = max(-int(values.min(initial=0)), int(values.max(initial=0)))
             kind = np.int32 if most <= np.iinfo(np.int32).max else np.float64 if most <= _EXACT else None
@@ -111,6 +113,14 @@ def storable(labels: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], list
         else:
             kept[name] = values.astype(kind)
     return kept, others
+
+
+def left_out(path: Path, cloud: PointCloud) -> list[str]:
+    """Names of the columns, and "faces", that the format of `path` does not hold."""
+    if path.suffix.lower() == ".npz":
+        return [name for name in cloud.labels if name in _NPZ_OWN]
+    flat = path.suffix.lower() == ".pcd" and cloud.faces is not None
+    return storable(cloud.labels)[1] + (["faces"] if flat else [])
 
 
 def _cloud_of(element: Element, path: Path) -> PointCloud:
@@ -137,7 +147,8 @@ def _cloud_of(element: Element, path: Path) -> PointCloud:
 
 
 def _floats(points: np.ndarray) -> np.ndarray:
-    return points.astype(np.result_type(points.dtype, np.float32), copy=False)
+    wide = np.result_type(points.dtype, np.float32).itemsize > 4
+    return points.astype(np.float64 if wide else np.float32, copy=False)
 
 
 def _columns_of(cloud: PointCloud, normals: tuple[str, ...]) -> dict[str, np.ndarray]:
@@ -220,7 +231,7 @@ def _read_npz(path: Path) -> PointCloud:
 def _write_npz(path: Path, cloud: PointCloud) -> None:
     parts = {"points": cloud.points, "colors": cloud.colors, "normals": cloud.normals, "faces": cloud.faces}
     arrays = {name: values for name, values in parts.items() if values is not None}
-    everything: dict[str, Any] = arrays | cloud.labels
+    everything: dict[str, Any] = arrays | {n: v for n, v in cloud.labels.items() if n not in _NPZ_OWN}
     write_file(path, lambda file: np.savez(file, **everything))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from perception.errors import InputError
-from perception.io.cloud import read_cloud, to_uint8, write_cloud
+from perception.io.cloud import left_out, read_cloud, to_uint8, write_cloud
 from perception.io.ply import Lists, read_ply
 from perception.types import PointCloud
 
@@ -270,12 +270,18 @@ def test_columns_are_written_in_a_type_that_the_format_has(suffix: str, tmp_path
         "large": np.arange(N, dtype=np.uint64) + 2**40,
         "valid": np.arange(N) % 2 == 0,
         "half": np.arange(N, dtype=np.float16),
+        "extended": np.arange(N).astype(np.longdouble),
         "u": np.full(N, 2**32 - 1, np.uint32),
         "d": np.linspace(0, 1, N),
     }
-    lost = {"stamp": STAMPS, "two words": np.zeros(N), "red": np.zeros(N, np.uint8)}
-    write_cloud(tmp_path / f"a.{suffix}", PointCloud(XYZ, labels=exact | (lost if suffix != "npz" else {})))
+    lost: dict[str, np.ndarray] = {"stamp": STAMPS, "two words": np.zeros(N), "red": np.zeros(N, np.uint8)}
+    if suffix == "npz":
+        lost = {name: np.zeros(N) for name in ("points", "colors", "file")}
+    given = PointCloud(XYZ.astype(np.longdouble), labels=exact | lost)
+    assert left_out(tmp_path / f"a.{suffix}", given) == list(lost)
+    write_cloud(tmp_path / f"a.{suffix}", given)
     cloud = read_cloud(tmp_path / f"a.{suffix}")
+    assert np.array_equal(cloud.points, XYZ)
     assert cloud.labels.keys() == exact.keys() and cloud.colors is None
     assert all(np.array_equal(cloud.labels[name], values) for name, values in exact.items())
 
