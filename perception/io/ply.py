@@ -10,7 +10,7 @@ import re
 import struct
 from array import array
 from codecs import BOM_UTF8
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -199,8 +199,7 @@ class _Body:
         if not all((count == n).all() for count, n in zip(counts, lengths, strict=True)):
             return None, found
         self.at += rows.nbytes
-        columns = [(p.name, _cast(rows[str(number)], p.kind)) for number, p in enumerate(table.properties)]
-        return dict(reversed(columns)), found
+        return _named(table, [_cast(rows[str(n)], p.kind) for n, p in enumerate(table.properties)]), found
 
     def lengths(self, table: Table, rows: int) -> list[np.ndarray]:
         """The lengths [rows] of the lists of each list property, read row by row; then `at` is behind the rows.
@@ -252,14 +251,18 @@ class _Body:
                 columns[i][filled[i] : filled[i] + len(spots)] = _cast(values, table.properties[i].kind)
                 filled[i] += len(spots)
                 at += head + kind.itemsize * n
-        found: list[tuple[str, np.ndarray | Lists]] = [
-            (p.name, values if n is None else Lists(values, n))
-            for p, values, n in zip(table.properties, columns, counts, strict=True)
-        ]
-        return dict(reversed(found))
+        return _named(table, [v if n is None else Lists(v, n) for v, n in zip(columns, counts, strict=True)])
 
     def _stored(self, kind: str) -> str:
         return "f8" if self.text else self.order + kind
+
+
+def _named(table: Table, columns: Sequence[np.ndarray | Lists]) -> Element:
+    """The columns by name, in order; of one name the first."""
+    found: Element = {}
+    for p, values in zip(table.properties, columns, strict=True):
+        found.setdefault(p.name, values)
+    return found
 
 
 def _numbers(file: BinaryIO) -> np.ndarray:

@@ -108,6 +108,7 @@ def test_elements_without_properties_and_repeated_names(tmp_path: Path) -> None:
     )
     path.write_bytes(path.read_bytes().replace(b"property int q", b"property int x"))
     np.testing.assert_array_equal(read_cloud(path).points, XYZ)
+    assert list(read_ply(path)["vertex"]) == ["x", "y", "z", "red", "green", "blue"]  # in the order of the file
     with pytest.raises(InputError, match="expected x, y and z"):
         path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 2\nend_header\n")
         read_cloud(path)
@@ -139,6 +140,7 @@ def test_lists_of_different_lengths(order: str, tmp_path: Path) -> None:
         assert lists.values.tolist() == [v for r in rows for v in r]
     assert elements["face"]["flag"].tolist() == [7] * len(faces)
     cloud = read_cloud(tmp_path / "a.ply")
+    assert list(elements["vertex"]) == [*"xyz", "view_indices", "view_weights", "after"]
     np.testing.assert_array_equal(cloud.points, XYZ)
     assert cloud.labels["after"].tolist() == list(range(N)) and set(cloud.labels) == {"after"}
     assert cloud.faces.tolist() == [[f[0], f[i], f[i + 1]] for f in faces for i in range(1, len(f) - 1)]
