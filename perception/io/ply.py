@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import struct
+import warnings
 from array import array
 from codecs import BOM_UTF8
 from collections.abc import Mapping, Sequence
@@ -94,7 +95,7 @@ def read_body(path: Path, file: BinaryIO, order: str, tables: list[Table]) -> di
     """The tables that follow a header, as `read_ply` returns them. order: of bytes, "<" or ">"; "" for text."""
     try:
         source = _Body(file, order)
-    except ValueError as error:
+    except (ValueError, DeprecationWarning) as error:
         raise InputError(f"{path}: holds text where numbers are expected ({error})") from error
     elements = {table.name: _read_element(source, table, path) for table in tables}
     if source.text and source.at < len(source.body):
@@ -266,14 +267,17 @@ def _named(table: Table, columns: Sequence[np.ndarray | Lists]) -> Element:
 
 
 def _numbers(file: BinaryIO) -> np.ndarray:
-    """The numbers of a text [N] float64, from where the file is; ValueError for other words."""
+    """The numbers of a text [N] float64, from where the file is; for other words ValueError, or DeprecationWarning
+    before NumPy 2.4, which would leave them and all that follows out."""
     start = file.tell()
-    try:
-        return np.fromfile(file, np.float64, sep=" ")
-    except ValueError:
-        file.seek(start)
-        text = _MSVC_NAN.sub(b"nan", file.read())
-        return np.fromstring(text, np.float64, sep=" ") if text.strip() else np.empty(0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)
+        try:
+            return np.fromfile(file, np.float64, sep=" ")
+        except (ValueError, DeprecationWarning):
+            file.seek(start)
+            text = _MSVC_NAN.sub(b"nan", file.read())
+            return np.fromstring(text, np.float64, sep=" ") if text.strip() else np.empty(0)
 
 
 def _cast(values: np.ndarray, kind: str) -> np.ndarray:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import struct
+import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -180,6 +182,24 @@ def test_numbers_that_are_not_finite_in_a_text(word: str, tmp_path: Path) -> Non
     cloud = read_cloud(tmp_path / "a.ply")
     assert np.isfinite(cloud.points).tolist() == [[True] * 3, [True, False, True]]
     assert cloud.labels["t"].tolist() == [1_700_000_000, 7]
+
+
+def test_words_in_a_text_are_told_by_an_older_numpy_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before 2.4 it warned of a word and returned the numbers before it."""
+
+    def older(source: Any, kind: type, sep: str) -> np.ndarray:
+        text = source if isinstance(source, bytes) else source.read()
+        try:
+            return np.array(text.split(), kind)
+        except ValueError:
+            warnings.warn("unmatched data", DeprecationWarning, stacklevel=2)
+            return np.arange(3.0)
+
+    for name in ("fromfile", "fromstring"):
+        monkeypatch.setattr(np, name, older)
+    test_numbers_that_are_not_finite_in_a_text("-1.#IND00", tmp_path)
+    with pytest.raises(InputError, match="text where numbers are expected"):
+        test_numbers_that_are_not_finite_in_a_text("six", tmp_path)
 
 
 LEVELS = np.linspace(0, 1, 3 * N).reshape(N, 3)
