@@ -41,7 +41,7 @@ def features_to_rgb(features: np.ndarray) -> np.ndarray:
     """
     flat = features.reshape(-1, features.shape[-1]).astype(np.float64)
     center = flat.mean(0)
-    _, axes = np.linalg.eigh(np.cov((flat - center).T).reshape(flat.shape[1], -1))
+    _, axes = np.linalg.eigh(np.cov((flat - center).T, ddof=0).reshape(flat.shape[1], -1))
     axes = axes[:, ::-1][:, :3]
     strongest = np.abs(axes).argmax(0)
     axes = axes * np.sign(axes[strongest, np.arange(axes.shape[1])])

@@ -66,6 +66,7 @@ def test_features_to_rgb_ignores_rotation_up_to_axis_signs() -> None:
     for k in range(3):
         assert min(np.abs(a[..., k] - b[..., k]).max(), np.abs(255 - a[..., k] - b[..., k]).max()) <= 1
     assert pictures.features_to_rgb(features[..., :2]).shape == (40, 30, 3)
+    assert pictures.features_to_rgb(features[:1, :1]).tolist() == [[[0, 0, 0]]]  # one pixel has no components
 
 
 def test_outline_and_row() -> None:
