@@ -22,13 +22,15 @@ from perception.splats.spz import COLOR_SCALE, FLIPS, HEADER, MAGIC
 VERSION = 2
 FIRST_BITS, REST_BITS = 5, 4
 """Bits that are kept of harmonics of degree 1, and of higher ones; fewer compress better."""
+FARTHEST = 1 << 22
+"""Largest coordinate: with no bits behind the point, of 24 with sign."""
 
 
 def write_spz(path: Path, gmap: Map) -> None:
     """Writes all Gaussians in map order, and their instance ids [N] int32 (−1 = none) beside it as `.npy`, same stem.
 
     Errors: positions 2⁻ᵇ / 2 with b = 12 bits or as many as the map's size leaves, log-scales 1/32, opacities and
-    colours 1/510. InputError where a value is not finite.
+    colours 1/510. InputError as `spz_bytes`.
     """
     data = spz_bytes(gmap, path)
     write_file(path.with_suffix(".npy"), lambda file: np.save(file, gmap.instance_ids.astype(np.int32)))
@@ -36,13 +38,15 @@ def write_spz(path: Path, gmap: Map) -> None:
 
 
 def spz_bytes(gmap: Map, path: Path = Path("map.spz")) -> bytes:
-    """The file's bytes. InputError naming `path` where a value is not finite."""
+    """The file's bytes. InputError naming `path` where a value is not finite, or a mean beyond what 24 bits hold."""
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
         if not np.isfinite(getattr(gmap, name)).all():
             raise InputError(f"{path}: {name} of some Gaussians are not finite; upgrade or rebuild the map")
     count, degree = len(gmap), math.isqrt(gmap.sh.shape[1]) - 1
     means = gmap.means.astype(np.float64) * [1, -1, -1]
     largest = max(1.0, float(np.abs(means).max(initial=0.0)))
+    if largest > FARTHEST:
+        raise InputError(f"{path}: a Gaussian lies {largest:.3g} from the origin, at most {FARTHEST} is held; use .ply")
     bits = min(12, 22 - math.ceil(math.log2(largest)))
     fixed = np.rint(means * 2.0**bits).astype("<i4")
     positions = np.ascontiguousarray(fixed).view(np.uint8).reshape(count, 3, 4)[:, :, :3]

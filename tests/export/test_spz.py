@@ -35,7 +35,7 @@ def a_map(degree: int = 3, size: float = 5.0, count: int = 200) -> Map:
     )
 
 
-@pytest.mark.parametrize(("degree", "size"), [(0, 5.0), (1, 0.1), (3, 5.0), (3, 3000.0)])
+@pytest.mark.parametrize(("degree", "size"), [(0, 5.0), (1, 0.1), (3, 5.0), (3, 3000.0), (0, 4e6)])
 def test_values_are_what_the_bits_can_hold(degree: int, size: float) -> None:
     gmap = a_map(degree, size)
     found = read_spz(spz_bytes(gmap))
@@ -87,8 +87,11 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "labels of a scan" in capsys.readouterr().err
 
 
-def test_a_value_that_is_not_finite_is_told(tmp_path: Path) -> None:
+def test_a_value_that_no_bits_hold_is_told(tmp_path: Path) -> None:
     gmap = a_map()
+    gmap.means[3, 1] = -5e6
+    with pytest.raises(InputError, match=r"a Gaussian lies 5e\+06 from the origin, at most 4194304 is held"):
+        spz_bytes(gmap)
     gmap.means[3] = np.nan
     with pytest.raises(InputError, match="means of some Gaussians are not finite"):
         spz_bytes(gmap)
