@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -29,8 +28,8 @@ MESHES = (".ply", ".glb")
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 MOST_VOXELS = 200_000_000
 _SLAB = 1 << 19
-BODY_BYTES = 150
-"""Of each voxel while a closed mesh is made."""
+BODY_BYTES, SPACE_BYTES = 150, 65
+"""Of each voxel, at the peak, while a closed mesh and while a map of distances is made, measured."""
 
 
 def check_outputs(mesh: Path | None, voxels: Path | None, voxel_size: float | None) -> None:
@@ -68,7 +67,7 @@ def export_mesh(
         method = "TSDF of rendered depth"
     else:
         own = gmap.instance_ids == instance
-        if not own.any():
+        if instance < 0 or not own.any():
             raise InputError(f"--instance {instance}: the map has no such instance; `perception query` lists their ids")
         opaque = own & (gmap.opacities >= min(SURFACE_OPACITY, gmap.opacities[own].max()))
         bounds = np.percentile(gmap.means[opaque], [1, 99], axis=0)
@@ -141,11 +140,13 @@ def _unit(gmap: Map) -> str:
     return "m" if gmap.metric else "unknown"
 
 
-def grid_shape(low: np.ndarray, high: np.ndarray, voxel: float) -> tuple[int, int, int]:
-    """Voxels of a side above 0 from corner `low` to beyond `high`; InputError when they are too many."""
+def grid_shape(low: np.ndarray, high: np.ndarray, voxel: float, each: int = SPACE_BYTES) -> tuple[int, int, int]:
+    """Voxels of a side above 0 from corner `low` to beyond `high`; InputError when they are too many, or for the memory
+    of `each` bytes a voxel."""
     shape = np.maximum(np.ceil((high - low) / voxel), 1)
     if shape.prod() > MOST_VOXELS:
         raise InputError(f"--voxel-size {voxel:g} gives {shape.prod():.2g} voxels; at most {MOST_VOXELS:.0e} are held")
+    require_memory(each * float(shape.prod()), f"--voxel-size {voxel:g}", "choose larger voxels")
     return int(shape[0]), int(shape[1]), int(shape[2])
 
 
@@ -189,8 +190,7 @@ def closed_body(
     """
     from skimage.measure import marching_cubes
 
-    shape = grid_shape(low, high, voxel)
-    require_memory(BODY_BYTES * math.prod(shape), f"--voxel-size {voxel:g}", "choose larger voxels")
+    shape = grid_shape(low, high, voxel, BODY_BYTES)
     voxels, reach = centres(low, shape, voxel), 3 * voxel
     on, free, gap = observe(voxels, views, reach)
     level = np.where((on > 0) & (2 * on >= free), gap / reach, np.where(free > 0, 1.0, -1.0))

@@ -141,7 +141,9 @@ def test_glb_holds_the_mesh(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["m.glb"]
 
 
-def test_a_body_that_memory_does_not_hold_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bodies_and_voxels_that_memory_does_not_hold_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("perception.machine.available_memory", lambda: 2.0**28)
+    with pytest.raises(InputError, match="choose larger voxels"):
+        grid_shape(np.zeros(3), np.ones(3), 0.005)  # 8 million voxels of 0.5 GiB together
     with pytest.raises(InputError, match="choose larger voxels"):
         closed_body(np.full(3, -0.6), np.full(3, 0.6), 0.008, ball_views(2), np.zeros((1, 3)), np.ones(1, bool))

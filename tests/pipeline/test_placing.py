@@ -109,10 +109,11 @@ def test_a_scan_without_a_place_is_refused_and_nothing_is_written(path: Path, tm
     assert main(["export", str(path)]) == 2
     assert main(["export", str(path), "--mesh", str(tmp_path / "m.stl")]) == 2
     assert main(["export", str(path), "--voxels", str(tmp_path / "v.npz"), "--voxel-size", "0"]) == 2
-    assert main(["export", str(path), "--mesh", str(tmp_path / "m.ply"), "--instance", "77"]) == 2
+    for number in ("77", "-1"):  # -1: Gaussians of no instance
+        assert main(["export", str(path), "--mesh", str(tmp_path / "m.ply"), "--instance", number]) == 2
     assert sorted(tmp_path.iterdir()) == before
     lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 6 and all("\n" not in line for line in lines)
+    assert len(lines) == 7 and all("\n" not in line for line in lines)
 
 
 def test_voxels_and_one_body_need_no_open3d(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
