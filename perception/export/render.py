@@ -31,6 +31,8 @@ from perception.query.query_map import QueryMap
 from perception.types import View
 
 KINDS = ("rgb", "depth", "instances", "features")
+WIDEST = 5.0
+"""Tangent of the angle to the axis, 79°, up to which a lens is rendered: at 90° the pinhole image has no end."""
 
 
 def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[str]) -> tuple[dict[str, Any], str]:
@@ -104,19 +106,25 @@ def _cameras(path: Path) -> list[View]:
 
 
 def _through_lens(kind: str, gaussians: Gaussians, gmap: Map, view: View) -> np.ndarray:
-    """The image with the view's lens distortion, warped from a wider pinhole image."""
+    """The image with the view's lens distortion, warped from a wider pinhole image; 0 beyond WIDEST."""
     if view.lens is None:
         return _picture(kind, gaussians, gmap, view)
     width, height = view.lens.width, view.lens.height
     grid = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1).reshape(-1, 2)
-    rays = np.asarray(camera_from_lens(view.lens).cam_from_img(grid), np.float64)[:, :2]
-    low, high = rays.min(axis=0), rays.max(axis=0)
+    camera = camera_from_lens(view.lens)
+    rays = np.asarray(camera.cam_from_img(grid), np.float64)[:, :2]
+    back = np.asarray(camera.img_from_cam(np.c_[rays, np.ones(len(rays))]))  # another pixel where the lens has no ray
+    seen = ((np.abs(rays) <= WIDEST) & (np.abs(back - grid) < 0.5)).all(axis=1)
+    if not seen.any():
+        raise InputError(f"{view.name}: no pixel of its lens looks within 79° of the optical axis; correct its camera")
+    low, high = rays[seen].min(axis=0), rays[seen].max(axis=0)
     fx, fy = view.K[0, 0], view.K[1, 1]
     K = np.array([[fx, 0, 1 - fx * low[0]], [0, fy, 1 - fy * low[1]], [0, 0, 1.0]])
     size = np.ceil((high - low) * [fx, fy] + 2).astype(int)
     wide = View(view.name, view.photo, K, int(size[0]), int(size[1]), view.camera_from_world)
     picture = _picture(kind, gaussians, gmap, wide)
-    where = (rays * [fx, fy] + K[:2, 2] - 0.5).astype(np.float32).reshape(height, width, 2)
+    where = np.where(seen[:, None], rays * [fx, fy] + K[:2, 2] - 0.5, -9.0)  # -9: outside
+    where = where.astype(np.float32).reshape(height, width, 2)
     # Ids and depths must not be interpolated.
     interpolation = cv2.INTER_CUBIC if picture.dtype == np.uint8 else cv2.INTER_NEAREST
     return np.asarray(cv2.remap(picture, where[..., 0], where[..., 1], interpolation))

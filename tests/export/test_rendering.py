@@ -68,6 +68,25 @@ def test_photos_beside_the_camera_files_folder_are_rendered_below_the_output(tmp
     assert picture is not None and picture.shape == (24, 32, 3)
 
 
+def test_a_fisheye_lens_of_any_width_shows_what_a_pinhole_shows_up_to_79_degrees(tmp_path: Path) -> None:
+    """r = f θ (equidistant) against tan θ; at the corners θ is 254°, whose pinhole image has no end."""
+    write_map(tmp_path / "m.gsmap", small_map(400))
+    path, size, focal = camera_file(tmp_path, ["a.jpg"]), 64, 64 / (2 * np.pi)
+    lens = {"fl_x": focal, "fl_y": focal, "cx": 32, "cy": 32, "w": size, "h": size, "camera_model": "OPENCV_FISHEYE"}
+    pictures = []
+    for head in (lens, {"fl_x": 80, "fl_y": 80, "cx": 400, "cy": 400, "w": 800, "h": 800, "camera_model": "PINHOLE"}):
+        path.write_text(json.dumps(json.loads(path.read_text()) | head | {"k1": 0, "k2": 0, "k3": 0, "k4": 0}))
+        render_map(tmp_path / "m.gsmap", tmp_path / "out", path, ["instances"])
+        pictures.append(cv2.imread(str(tmp_path / "out" / "a.png"), cv2.IMREAD_UNCHANGED))
+    offset = np.stack(np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5), axis=-1) - 32
+    angle = np.linalg.norm(offset, axis=-1) / focal
+    column, row = np.moveaxis(400 + 80 * offset / (angle * focal)[..., None] * np.tan(angle)[..., None], -1, 0)
+    near = angle < np.radians(75)
+    expected = pictures[1][row[near].astype(int), column[near].astype(int)]
+    assert (expected > 0).sum() > 20 and (pictures[0][near] == expected).mean() > 0.95
+    assert not pictures[0][angle > np.radians(83)].any()
+
+
 @pytest.mark.parametrize("name", [*OUTSIDE, "/tmp/outside.jpg"])
 def test_a_label_image_lies_below_its_folder(name: str, tmp_path: Path) -> None:
     view = View(name, tmp_path / "photo.jpg", np.eye(3), 4, 3, np.eye(4))
