@@ -115,8 +115,8 @@ def require_memory(needed: float, what: str, advice: str) -> None:
 
 
 def available_memory() -> float:
-    """Bytes that can be allocated without swapping (Linux kernel's estimate), at most `memory_limit`."""
-    limit = memory_limit() or math.inf
+    """Bytes that can be allocated without swapping: the Linux kernel's estimate, and what control groups have left."""
+    limit = min([memory_limit() or math.inf, *(_left_of(folder) for folder in _control_groups("memory"))])
     try:
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):
@@ -170,6 +170,18 @@ def _memory_of(folder: Path) -> float:
         try:
             return int((folder / name).read_text(encoding="ascii"))
         except (OSError, ValueError):  # not there, or "max"
+            continue
+    return math.inf
+
+
+def _left_of(folder: Path) -> float:
+    """Bytes that one control group has left, with cached files, which the kernel drops; infinity where unknown."""
+    for used, prefix in (("memory.current", ""), ("memory.usage_in_bytes", "total_")):
+        try:
+            stat = dict(line.split() for line in (folder / "memory.stat").read_text(encoding="ascii").splitlines())
+            cached = int(stat[f"{prefix}inactive_file"]) + int(stat[f"{prefix}active_file"])
+            return max(_memory_of(folder) - int((folder / used).read_text(encoding="ascii")) + cached, 0)
+        except (OSError, ValueError, KeyError):
             continue
     return math.inf
 

@@ -74,6 +74,23 @@ def test_memory(groups: Callable, own: str, files: dict[str, str], expected: int
         module.require_memory(expected, "cloud", "split it")
 
 
+@pytest.mark.parametrize(
+    ("own", "at", "limit", "used", "prefix"),
+    [
+        ("0::/a/b\n", "a", "memory.max", "memory.current", ""),
+        ("3:memory:/x\n", "memory/x", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_"),
+    ],
+)
+def test_memory_in_use_is_not_free_but_for_cached_files(
+    groups: Callable, own: str, at: str, limit: str, used: str, prefix: str
+) -> None:
+    stat = f"anon 1\n{prefix}active_file 20000\n{prefix}inactive_file 30000\n"
+    groups(own, {f"{at}/{limit}": "1000000\n", f"{at}/{used}": "700000\n", f"{at}/memory.stat": stat})
+    assert module.available_memory() == 350_000 and module.memory_limit() == 1_000_000
+    groups(own, {f"{at}/{used}": "1100000\n"})
+    assert module.available_memory() == 0
+
+
 def test_work_in_threads_comes_in_order_and_no_further_than_needed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Later items end first; none is begun while many results wait; the first error is raised and ends the rest."""
     monkeypatch.setattr(module, "cores", lambda: 3)
