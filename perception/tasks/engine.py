@@ -156,10 +156,11 @@ def run_in_processes(task: Callable[[str], Any], items: Sequence[str], what: str
         child = subprocess.Popen(whole, stdout=quiet, stderr=heard, text=True, start_new_session=True)
         running.append(child)
         said = child.communicate()[1].strip()
-        if "Traceback" in said:
+        if child.returncode and "Traceback" in said:
             raise RuntimeError(said)
-        if child.returncode:
-            raise InputError(said or f"{what}: a process ended with code {child.returncode}; is memory short?")
+        if child.returncode:  # 1: of an InputError, whose line is the last
+            told = said.rpartition("\n")[2] if child.returncode == 1 else ""
+            raise InputError(told or f"{what}: a process ended with code {child.returncode}; is memory short?")
 
     with ThreadPoolExecutor(cores()) as pool:
         submitted = [pool.submit(run, item) for item in items]
