@@ -34,8 +34,9 @@ if TYPE_CHECKING:
 MOST_VIEWS, LONG_SIDE = 90, 320
 """Views rendered for a registration, and their size in pixels."""
 
-
 SCANNET = Path("scannet")
+BESIDE = 0.1
+"""Distance in diagonals of a map up to which a scan beside its bounds may be of its outermost things."""
 
 
 @dataclass(frozen=True)
@@ -269,7 +270,7 @@ def export_labels(
 
 def check_overlap(means: np.ndarray, points: np.ndarray) -> float:
     """Share of the finite points inside the map's bounds (1st to 99th percentile of its means).
-    InputError when the two bounding boxes do not overlap: the cloud has another frame or unit."""
+    InputError when they lie farther from the bounds than BESIDE: the cloud has another frame or unit."""
     finite = points[np.isfinite(points).all(axis=1)]
     if len(finite) == 0:
         raise InputError(f"cloud: of its {len(points)} points none is finite; nothing can be labelled")
@@ -279,7 +280,7 @@ def check_overlap(means: np.ndarray, points: np.ndarray) -> float:
     low, high = np.percentile(means, [1, 99], axis=0)
     cloud_low, cloud_high = finite.min(axis=0), finite.max(axis=0)
     gap = np.maximum(np.maximum(low - cloud_high, cloud_low - high), 0)
-    if gap.any():
+    if np.linalg.norm(gap) > BESIDE * np.linalg.norm(high - low):
         boxes = f"cloud {_box(cloud_low, cloud_high)}, map {_box(low, high)}"
         found = f"does not overlap the map: it lies {np.linalg.norm(gap):.3g} units away ({boxes})"
         raise InputError(f"cloud: {found}; bring it into the map's frame")

@@ -77,6 +77,15 @@ def test_a_cloud_in_another_frame_is_told_with_its_distance():
             check_overlap(cloud.points, nothing)
 
 
+def test_a_scan_of_what_lies_outermost_is_of_the_map() -> None:
+    """Bounds without the outermost hundredths must not refuse it; what lies far beside them is another frame."""
+    means = np.random.default_rng(0).uniform(0, 1, (1000, 3))
+    outermost = means[means[:, 0] > 0.995]
+    assert 0 < len(outermost) < 10 and check_overlap(means, outermost) == 0
+    with pytest.raises(InputError, match=r"it lies 0\.\d+ units away"):
+        check_overlap(means, outermost + np.array([0.3, 0, 0]))
+
+
 def test_one_point_and_duplicated_points_are_exported():
     means, ids = np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([3, 8], np.int32)
     assert export_labels(means, ids, PointCloud(np.array([[0.9, 0, 0]]))).tolist() == [8]
