@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from perception.errors import InputError, missing_extra
+from perception.io.documents import brief
 from perception.machine import cores
 from perception.progress import Progress
 
@@ -100,9 +101,9 @@ class Engine:
                 socket.create_connection((host, int(port)), timeout=CONNECT).close()
             if started:
                 _join(ray, self.address)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: of another version
             here, there = "Ray cannot start a cluster here", f"--address {self.address}: no Ray cluster there"
-            found = f"{here if self.address is None else there} ({str(error).splitlines()[0]})"
+            found = f"{here if self.address is None else there} ({brief(error, 300)})"
             raise InputError(f"{found}; start one: ray start --head, and give its --address HOST:PORT") from error
         try:
             host = ray.util.get_node_ip_address()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import socket
 import tempfile
 from pathlib import Path
 
 import pytest
 
-from perception.progress import Progress
+from perception.errors import InputError
+from perception.progress import QUIET, Progress
 from perception.tasks.engine import Engine
 
 pytest.importorskip("ray")
@@ -33,6 +35,19 @@ def test_a_task_has_a_machine_of_its_own_or_a_core(monkeypatch: pytest.MonkeyPat
             assert engine.run(given, ["a", "b"], "task", shown, each_core=True) == [1.0, 1.0]
         finally:
             cluster.shutdown()
+
+
+def test_a_cluster_of_another_version_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    import ray
+
+    def init(*_: object, **__: object) -> None:  # as ray._private.utils.check_version_info
+        raise RuntimeError("Version mismatch: The cluster was started with:\n    Ray: 2.0\n    Python: 3.10.1\nThis")
+
+    monkeypatch.setattr(ray, "init", init)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        engine = Engine("ray", f"127.0.0.1:{server.getsockname()[1]}")
+        with pytest.raises(InputError, match=r"no Ray cluster there \(Version mismatch: .* Ray: 2\.0 Python: 3\.10\.1"):
+            engine.run(print, ["a"], "task", QUIET)
 
 
 @pytest.mark.slow
