@@ -44,10 +44,8 @@ def missing_extra(package: str, extra: str) -> InputError:
 
 
 def packaged_file(package: str, pattern: str) -> Path:
-    """Path of a weight file that an installed package contains. The package is not imported.
-
-    pattern: for Path.glob, relative to the package's folder. Raises InputError if the package or the file is missing.
-    """
+    """Path of a weight file that an installed package contains; the package is not imported. pattern: for Path.glob,
+    relative to its folder. InputError if the package or the file is missing."""
     spec = importlib.util.find_spec(package)
     if spec is None or spec.origin is None:
         raise missing_extra(package.replace("_", "-"), "demo")

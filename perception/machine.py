@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import math
 import os
@@ -11,7 +12,6 @@ import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 from typing import TypeVar
@@ -63,10 +63,8 @@ def in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterato
 
 
 def limit_threads() -> None:
-    """Where control groups grant fewer cores than there are, the libraries and the compiled core start no more threads.
-
-    Call it before they are loaded. Threads beyond the quota would all be halted for most of every period of 100 ms.
-    """
+    """Where control groups grant fewer cores than there are, the libraries and the compiled core start no more threads,
+    which would all be halted for most of every period of 100 ms. Call it before they are loaded."""
     granted = cores()
     if granted == _scheduled():
         return
@@ -77,16 +75,13 @@ def limit_threads() -> None:
     _core.training.set_threads(granted)
 
 
-@contextmanager
+@contextlib.contextmanager
 def torch_on_one_thread() -> Iterator[None]:
-    """Within it torch computes on one thread, and the rasterizer by default on as many as torch had before.
-
-    Idle workers of torch's OpenMP pool busy-wait for milliseconds, on processors that other threads need: with two
-    threads on two busy processors, a training step took four times the CPU time. Without torch, nothing is done.
-    """
+    """Within it torch, if it is loaded, computes on one thread, and the rasterizer by default on as many as torch had.
+    Idle workers of torch's OpenMP pool busy-wait on processors that other threads need: with two threads on two busy
+    processors, a training step took four times the CPU time."""
     torch = sys.modules.get("torch")
-    before = 1 if torch is None else torch.get_num_threads()
-    if torch is None or before == 1:
+    if torch is None or (before := torch.get_num_threads()) == 1:
         yield
         return
     token = threads_before.set(threads_before.get() or before)
@@ -117,12 +112,10 @@ def require_memory(needed: float, what: str, advice: str) -> None:
 def available_memory() -> float:
     """Bytes that can be allocated without swapping: the Linux kernel's estimate, and what control groups have left."""
     limit = min([memory_limit() or math.inf, *(_left_of(folder) for folder in _control_groups("memory"))])
-    try:
+    with contextlib.suppress(OSError):
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):
                 return min(limit, int(line.split()[1]) * 1024)
-    except OSError:
-        pass
     return limit
 
 
@@ -167,22 +160,18 @@ def _cores_of(folder: Path) -> float:
 def _memory_of(folder: Path) -> float:
     """Bytes that one control group grants: memory.max, or in version 1 memory.limit_in_bytes; infinity without."""
     for name in ("memory.max", "memory.limit_in_bytes"):
-        try:
+        with contextlib.suppress(OSError, ValueError):  # not there, or "max"
             return int((folder / name).read_text(encoding="ascii"))
-        except (OSError, ValueError):  # not there, or "max"
-            continue
     return math.inf
 
 
 def _left_of(folder: Path) -> float:
     """Bytes that one control group has left, with cached files, which the kernel drops; infinity where unknown."""
     for used, prefix in (("memory.current", ""), ("memory.usage_in_bytes", "total_")):
-        try:
+        with contextlib.suppress(OSError, ValueError, KeyError):
             stat = dict(line.split() for line in (folder / "memory.stat").read_text(encoding="ascii").splitlines())
             cached = int(stat[f"{prefix}inactive_file"]) + int(stat[f"{prefix}active_file"])
             return max(_memory_of(folder) - int((folder / used).read_text(encoding="ascii")) + cached, 0)
-        except (OSError, ValueError, KeyError):
-            continue
     return math.inf
 
 

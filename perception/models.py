@@ -24,11 +24,8 @@ _PURPOSES = {"encoder": "sam", "decoder": "sam", "image tower": "clip", "text to
 
 
 def check_file(file: str) -> dict[str, Any]:
-    """Describes an ONNX file, a folder of them or a stored model: one dict per file under "files", and warnings.
-
-    Each: file, family, role, inputs and outputs with shapes, providers (those in use). Raises InputError when a
-    file is not an ONNX model, and for a SAM encoder and decoder that do not fit together.
-    """
+    """Describes an ONNX file, a folder of them or a stored model: `describe_graph` of each under "files", and warnings.
+    InputError when a file is not an ONNX model, and for a SAM encoder and decoder that do not fit together."""
     stored = find_model(file)
     path = stored.folder if stored and not Path(file).exists() else Path(file).expanduser()
     left_out: list[Path] = []

@@ -35,10 +35,8 @@ def outline(photo: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def features_to_rgb(features: np.ndarray) -> np.ndarray:
-    """Features [..., D] -> colours [..., 3] uint8: their first three principal components, stretched to 1-99 %.
-
-    Axis signs are made unique.
-    """
+    """Features [..., D] -> colours [..., 3] uint8: their first three principal components, of unique signs, stretched
+    to 1-99 %."""
     flat = features.reshape(-1, features.shape[-1]).astype(np.float64)
     center = flat.mean(0)
     _, axes = np.linalg.eigh(np.cov((flat - center).T, ddof=0).reshape(flat.shape[1], -1))

@@ -47,12 +47,9 @@ class Progress:
 
     def update(self, stage: str, done: int, total: int, *figures: str) -> None:
         """Shows the state of a stage; without a terminal, prints a line every ten seconds and at the end."""
-        if self.quiet:
-            return
         if self.terminal:
             self._draw(stage, done, total, figures)
-            return
-        if done >= total or time.monotonic() - self._last >= 10:
+        elif not self.quiet and (done >= total or time.monotonic() - self._last >= 10):
             self._last = time.monotonic()
             print("  ".join([f"{stage}: {done}/{total}", *figures]), file=self.stream, flush=True)
 

@@ -8,9 +8,8 @@
    pose, scan points in front of it against it. With colours, the best is refined on the rendered pictures.
 4. It is accepted if few points speak against it, if it cannot slide, and if no other pose is nearly as good.
 
-The search covers all poses, so of two that look alike both are found. Descriptors of points (FPFH with RANSAC) are not
-used: on surfaces of trained maps, centimetres rough, 2 % of their matches were right. Nothing is random, and no sum
-depends on the number of threads.
+The search covers all poses, so of two that look alike both are found. Of descriptors of points (FPFH) 2 % matched right
+on surfaces of trained maps, centimetres rough. Nothing is random, and no sum depends on the number of threads.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from scipy.ndimage import binary_dilation, map_coordinates
 
 from perception.errors import InputError
 from perception.export.align_steps import Images, Similarity, gray_images, jacobian, likely_rotations, robust_gain
-from perception.export.depth_views import DepthView, fused_surface, grid_cells, observe
+from perception.export.depth_views import DepthView, centres, fused_surface, grid_cells, observe
 from perception.export.neighbors import Neighbors, list_normals, neighbor_lists
 from perception.geometry import sums_by, transform
 from perception.types import PointCloud
@@ -132,11 +131,8 @@ class Registration:
         self.rows = np.arange(0, len(self.scan), max(len(self.scan) // ROWS, 1))
 
     def candidates(self) -> list[Similarity]:
-        """Places by the correlation, best first: the best two shifts of each rotation and scale.
-
-        Score: Σ of the grid over the N cells that the scan occupies, over √N. The sum alone grows with the scale: of a
-        cropped scan, right poses came after 200 larger ones.
-        """
+        """Places by the correlation, best first: the best two shifts of each rotation and scale. Score: Σ of the grid
+        over the N cells that the scan occupies, over √N; the sum alone grows with the scale."""
         step = self.extent / GRID
         low = self.points.min(axis=0) - 2 * step
         grid = self._evidence(low, step)
@@ -166,9 +162,8 @@ class Registration:
 
     def _evidence(self, low: np.ndarray, step: float) -> np.ndarray:
         """[X, Y, Z] float32: 1 in cells with surface, 0.5 beside them, −1 in free space, 0 unknown."""
-        shape = np.ceil((self.points.max(axis=0) + 2 * step - low) / step).astype(int)
-        centres = (np.indices(shape).reshape(3, -1).T + 0.5) * step + low
-        on, free, _ = observe(centres, self.views, step)
+        shape = np.ceil((self.points.max(axis=0) + 2 * step - low) / step).astype(int).tolist()
+        on, free, _ = observe(centres(low, shape, step), self.views, step)
         grid = np.where((free >= 2) & (free > on), -1.0, 0.0).reshape(shape)
         held = np.zeros(shape, bool)
         held[tuple(np.floor((self.points - low) / step).astype(int).T)] = True
@@ -259,10 +254,8 @@ class Registration:
 
     def _icp(self, pose: Similarity, rows: np.ndarray, widths: Sequence[float]) -> tuple[Similarity, float, np.ndarray]:
         """The pose after a step for each width, the weighted rms before the last, and its information matrix over Σ w.
-
         Each step lowers Σ w r², r = n·(s R p + t − q), w = (1 − r²/width²)² for |r| < width, else 0 (Tukey), of the
-        points p and the map's points q nearest to them, with normals n.
-        """
+        points p and the map's points q nearest to them, with normals n."""
         rms, information = np.inf, np.zeros((7, 7))
         for width in widths:
             index, _ = self.tree.query(pose(self.scan[rows]), 1, 3 * width)
@@ -300,10 +293,8 @@ class Registration:
 
     def _photometric_step(self, pose: Similarity, points: np.ndarray, light: np.ndarray, images: Images) -> Similarity:
         """A step that lowers Σ w (a_v I_v(π_v(s R p + t)) + b_v − g_p)² over views v and the points p on their depth.
-
         points [P, 3] of brightness g = light [P]; I_v: rendered brightness; a_v, b_v: gain and offset of each view; w:
-        Tukey's weights by the spread of the view's residuals.
-        """
+        Tukey's weights by the spread of the view's residuals."""
         moved = pose(points)
         middle, size = moved.mean(axis=0), 7 if self.similar else 6
         A, b = np.zeros((size, size)), np.zeros(size)

@@ -112,6 +112,11 @@ def grid_cells(points: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray
     return cell.reshape(-1), count
 
 
+def centres(low: np.ndarray, shape: Sequence[int], width: float) -> np.ndarray:
+    """Centres [X · Y · Z, 3] of a grid's cells of `width` from corner `low`, z fastest."""
+    return (np.indices(shape).reshape(3, -1).T + 0.5) * width + low
+
+
 def _backprojected(view: DepthView) -> tuple[np.ndarray, np.ndarray]:
     """Points and unit normals [P, 3] in the world, of every second pixel with depth whose neighbours have depth."""
     height, width = view.depth.shape

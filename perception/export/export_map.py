@@ -61,7 +61,7 @@ class ExportOptions:
 
 
 def rendered_depth(gmap: Map, most: int, long_side: int) -> list[DepthView]:
-    """Depth from up to `most` of the map's views, evenly chosen, in the map's frame; InputError without views."""
+    """Depth from up to `most` of the map's views, evenly chosen, in the map's frame. InputError without views."""
     from perception.export.depth_views import depth_views
     from perception.export.render import map_views
     from perception.gaussians.model import as_gaussians
@@ -195,15 +195,12 @@ def _export_spz(map_path: Path, output: Path, points: Path | None) -> tuple[dict
     """All Gaussians of the map, for viewers in the browser."""
     if points is not None:
         raise InputError(f"{output}: .spz holds the map's Gaussians; labels of a scan go to .ply, .pcd or .npz")
-    gmap = read_map(map_path)
+    gmap, ids = read_map(map_path), side_file(output)
     write_spz(output, gmap)
-    size, ids = output.stat().st_size, side_file(output)
+    size = output.stat().st_size
     share = size / max((map_path / "gaussians.ply").stat().st_size, 1)
     text = f"{output}: {len(gmap)} Gaussians, {share:.0%} of the PLY's size; instance ids in {ids}"
     return {"spz": str(output), "gaussians": len(gmap), "bytes": size, "instance_ids": str(ids)}, text
-
-
-_RECORD = ("state", "last_seen")
 
 
 def at_granularity(gmap: Map, granularity: str) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
@@ -300,18 +297,16 @@ def write_export(
 ) -> dict[str, Any]:
     """Writes the cloud with `instance_id` and its sidecar JSON (same stem); returns the sidecar.
 
-    labels [P] int32, −1 = none; points, order and other columns are the cloud's own. instances: {id: {"score",
-    "label"}} of the map.
-    Entries have "score", "label", "num_points"; those of parts also their `parent`, of groups the `instances` in them,
-    in a map of several visits `state` and `last_seen`.
-    facts: further keys of the sidecar.
+    labels [P] int32, −1 = none. instances: {id: entry} of the map, of which "score" and "label" are written with
+    "num_points"; of parts also their `parent`, of groups the `instances` in them, after several visits `state` and
+    `last_seen`. facts: further keys of the sidecar.
     """
     rows = {}
     ids, counts = np.unique(labels[labels >= 0], return_counts=True)
     for i, n in zip(ids.tolist(), counts.tolist(), strict=True):
         known = instances.get(i, {})
         row = {"score": float(known.get("score", 1.0)), "label": known.get("label"), "num_points": n}
-        rows[str(i)] = row | {key: known[key] for key in ("parent", "instances", *_RECORD) if key in known}
+        rows[str(i)] = row | {key: known[key] for key in ("parent", "instances", "state", "last_seen") if key in known}
     sidecar = {**(facts or {}), "instances": rows}
     write_file(path.with_suffix(".json"), json.dumps(sidecar, indent=1))
     labelled = {"instance_id": labels.astype(np.int32)}

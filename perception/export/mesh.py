@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from perception.colors import instance_palette, rgb8_from_sh
 from perception.errors import InputError
-from perception.export.depth_views import DepthView, observe
+from perception.export.depth_views import DepthView, centres, observe
 from perception.export.export_map import SURFACE_OPACITY, ExportOptions, export_labels, rendered_depth
 from perception.export.neighbors import nearest_gaussian
 from perception.frame.recentre import map_from_input
@@ -45,14 +45,12 @@ def check_outputs(mesh: Path | None, voxels: Path | None, voxel_size: float | No
 def export_mesh(
     gmap: Map, output: Path, instance: int | None, voxel: float | None, color: str
 ) -> tuple[dict[str, Any], str]:
-    """Writes the map's surface, or the closed body of one instance, with colours by vertex.
+    """Writes the map's surface, or the closed body of one instance, with colours by vertex. A .ply has `instance_id` by
+    vertex, too, and the input's coordinates, a .glb those of the map.
 
-    A .ply has `instance_id` by vertex, too, and the input's coordinates, a .glb those of the map.
-
-    The surface: rendered depth fused in a truncated signed distance field (`io.open3d.fuse_depth`), labelled as a scan
-    is. One instance: `closed_body`. voxel: None = two pixels at the median depth; of an instance
-    at least a 64th of its longest side. color: "original" or "instance". InputError for a map without views, and for an
-    instance that it does not have.
+    The surface: `io.open3d.fuse_depth`, labelled as a scan is. One instance: `closed_body`. voxel: None = two pixels at
+    the median depth; of an instance at least a 64th of its longest side. color: "original" or "instance". InputError
+    for a map without views, and for an instance that it does not have.
 
     >>> facts, line = export_mesh(Map.open(Path("room.gsmap")), Path("crate.ply"), 1, 0.05, "original")
     >>> facts["method"], facts["voxel_size"], facts["unit"]
@@ -81,7 +79,7 @@ def export_mesh(
     if output.suffix.lower() == ".glb":
         write_glb(output, points, colors, faces)
     else:
-        origin = _origin(gmap)
+        origin = _origin(gmap)  # of input coordinates, which need more than float32 there
         vertices = points + origin if origin.any() else points
         write_cloud(output, PointCloud(vertices, colors, None, faces, {"instance_id": labels}))
     facts = {"vertices": len(points), "faces": len(faces), "voxel_size": size, "method": method, "unit": _unit(gmap)}
@@ -118,7 +116,7 @@ def export_voxels(gmap: Map, output: Path, voxel: float | None) -> tuple[dict[st
     write_file(output, lambda file: np.savez(file, **arrays))
     shares = {name: float((state == value).mean()) for name, value in (("free", FREE), ("occupied", OCCUPIED))}
     facts = {"shape": list(state.shape), "voxel_size": size, "unit": _unit(gmap), **shares}
-    text = f"{output}: {' x '.join(map(str, state.shape))} voxels of {size:.4g} {_unit(gmap)}, "
+    text = f"{output}: {' x '.join(map(str, state.shape))} voxels of {size:.4g} {facts['unit']}, "
     return facts, text + f"{shares['free']:.0%} free, {shares['occupied']:.1%} occupied, the rest unknown"
 
 
@@ -150,11 +148,6 @@ def grid_shape(low: np.ndarray, high: np.ndarray, voxel: float, each: int = SPAC
     return int(shape[0]), int(shape[1]), int(shape[2])
 
 
-def centres(low: np.ndarray, shape: Sequence[int], voxel: float) -> np.ndarray:
-    """Centres [X · Y · Z, 3] of the voxels, z fastest."""
-    return (np.indices(shape).reshape(len(shape), -1).T + 0.5) * voxel + low
-
-
 def occupancy(low: np.ndarray, shape: tuple[int, int, int], voxel: float, views: Sequence[DepthView]) -> np.ndarray:
     """[X, Y, Z] uint8: OCCUPIED where views see a surface in the voxel (depth within half its diagonal of the centre),
     unless more than twice as many see farther, then FREE; UNKNOWN where none looks or all are blocked."""
@@ -184,9 +177,9 @@ def closed_body(
     """(vertices [V, 3] float32, faces [F, 3] int32) of a watertight mesh between corners `low` and `high`.
 
     Space carving (Kutulakos & Seitz 2000) with depth: a voxel is outside if views see farther than it, or if the
-    nearest of means [N, 3] is not `own` [N]; hidden space counts as body, so that a side which no photo shows
-    reaches to the bounds. Near the surface the mean of depth − z locates it in the voxel. The largest connected part is
-    kept, its hollows are filled, and the level 0 is meshed by marching cubes (Lorensen & Cline 1987).
+    nearest of means [N, 3] is not `own` [N]; hidden space is body, so that a side which no photo shows reaches to the
+    bounds. Near the surface the mean of depth − z locates it. The largest connected part without its hollows is meshed
+    by marching cubes (Lorensen & Cline 1987).
     """
     from skimage.measure import marching_cubes
 
@@ -194,8 +187,7 @@ def closed_body(
     voxels, reach = centres(low, shape, voxel), 3 * voxel
     on, free, gap = observe(voxels, views, reach)
     level = np.where((on > 0) & (2 * on >= free), gap / reach, np.where(free > 0, 1.0, -1.0))
-    nearest = nearest_gaussian(voxels, means)
-    level = np.where(own[nearest] & (nearest >= 0), level, np.maximum(level, 0.5)).reshape(shape)
+    level = np.where(own[nearest_gaussian(voxels, means)], level, np.maximum(level, 0.5)).reshape(shape)
     parts, count = ndimage.label(level < 0)
     if count == 0:
         raise InputError(f"the instance holds no voxel of {voxel:g}; choose a smaller --voxel-size")

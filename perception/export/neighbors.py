@@ -1,10 +1,9 @@
 """Nearest neighbours in 3D with the compiled k-d tree, exact in float32 relative to a common centre; the Gaussian with
 the nearest mean (OpenSplat3D), in chunks for clouds of any size; neighbourhoods of a cloud's points, and normals.
 
-It stands beside SciPy's for its speed and its ties: of equal distances the smaller index, on any number of threads.
-CPU seconds of `python tools speed.neighbors`, one thread, in turns: the nearest of 500,000 means for 1 M points 0.55
-(SciPy's cKDTree 2.8, small_gicp 2.1, pykdtree 2.1); 25 neighbours of each of 300,000 points 0.76 (2.1, 1.8, 2.2).
-NumPy takes 3.7 times as long for the normals, and 40 times for the edges of neighbour lists.
+It stands beside SciPy's for its ties, of equal distances the smaller index on any number of threads, and its speed:
+1 M points and 500,000 means take 0.55 CPU s, SciPy's cKDTree 2.8, small_gicp and pykdtree 2.1 (`python tools
+speed.neighbors`). NumPy takes 3.7 times as long for the normals, 40 times for the edges of neighbour lists.
 """
 
 from __future__ import annotations
@@ -19,11 +18,8 @@ CHUNK = 1 << 20  # points at a time: 24 MiB of working memory
 
 
 class Neighbors:
-    """A k-d tree over the finite ones of points [N, 3] (any float dtype).
-
-    For a cloud far from the origin, its centre is subtracted in float64 before conversion to float32, so that
-    georeferenced coordinates keep their precision.
-    """
+    """A k-d tree over the finite ones of points [N, 3] (any float dtype). Far from the origin, the centre of the cloud
+    is subtracted in float64 first, so that georeferenced coordinates keep their precision."""
 
     def __init__(self, points: np.ndarray, threads: int | None = None) -> None:
         finite = np.isfinite(np.asarray(points)).all(axis=-1)
@@ -44,25 +40,17 @@ class Neighbors:
         return np.ascontiguousarray(shifted, dtype=np.float32)
 
     def query(self, queries: np.ndarray, k: int = 1, max_distance: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
-        """The k nearest of queries [Q, 3]: indices [Q, k] int32 and distances [Q, k] float32, nearest first.
-
-        −1 and infinity where fewer than k points lie within max_distance, or the query is not finite. Equal
-        distances go to the smaller index.
-        """
-        queries = np.asarray(queries)
-        indices = np.empty((len(queries), k), np.int32)
-        squared = np.empty((len(queries), k), np.float32)
+        """The k nearest of queries [Q, 3]: indices [Q, k] int32 and distances [Q, k] float32, nearest first; −1 and
+        infinity where fewer than k points lie within max_distance, or the query is not finite."""
+        indices, squared = np.empty((len(queries), k), np.int32), np.empty((len(queries), k), np.float32)
         with np.errstate(over="ignore", invalid="ignore"):
             self._tree.knn(self.local(queries), indices, squared, float(max_distance), self.threads)
         return np.where(indices >= 0, self.rows[indices], -1), np.sqrt(squared, out=squared)
 
 
 def nearest_gaussian(points: np.ndarray, means: np.ndarray, max_distance: float | None = None) -> np.ndarray:
-    """Index [P] int64 of the nearest of means [N, 3] for each of points [P, 3].
-
-    −1 for points that are not finite or farther than max_distance from every mean. Equal distances go to the smaller
-    index. Means that are not finite are ignored.
-    """
+    """Index [P] int64 of the nearest of means [N, 3] for each of points [P, 3]; −1 for points that are not finite or
+    farther than max_distance from every mean. Means that are not finite are ignored."""
     result = np.full(len(points), -1, np.int64)
     if np.isfinite(means).all(axis=1).any():
         tree, limit = Neighbors(means), np.inf if max_distance is None else max_distance
@@ -81,11 +69,8 @@ def neighbor_lists(points: np.ndarray, k: int) -> np.ndarray:
 
 
 def list_normals(points: np.ndarray, lists: np.ndarray) -> np.ndarray:
-    """Normals [P, 3] float32 of the planes through the neighbour lists [P, k] of points [P, 3].
-
-    The normal is the direction of least variance of a point and its neighbours, of arbitrary sign, so weights must
-    not depend on the sign. Zero where the neighbours span no plane.
-    """
+    """Normals [P, 3] float32 of the planes through the neighbour lists [P, k] of points [P, 3]: the direction of least
+    variance of a point and its neighbours, of arbitrary sign; zero where they span no plane."""
     normals = np.empty((len(points), 3), np.float32)
     first = np.flatnonzero(np.isfinite(points).all(axis=1))[:1]
     local = (points - points[first].sum(axis=0)).astype(np.float32)  # relative to some point, to keep float32 precision

@@ -46,19 +46,17 @@ def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[st
     that the image aligns with its photo. InputError for a name that points outside `output`, and for an image that
     would replace a photo.
     """
-    for kind in what:
-        if kind not in KINDS:
-            raise InputError(f"--what: found '{kind}', expected one of: {', '.join(KINDS)}")
+    if wrong := [kind for kind in what if kind not in KINDS]:
+        raise InputError(f"--what: found '{wrong[0]}', expected one of: {', '.join(KINDS)}")
     gmap = read_map(map_path)
-    if cameras is None:
-        views = map_views(gmap)
-    else:
-        views = _cameras(cameras)
-        if not in_map_frame(cameras, gmap.info, gmap.views):
-            views = [moved(view, map_from_input(map_path, gmap.info)) for view in views]
+    views = map_views(gmap) if cameras is None else _cameras(cameras)
+    if cameras is not None and not in_map_frame(cameras, gmap.info, gmap.views):
+        views = [moved(view, map_from_input(map_path, gmap.info)) for view in views]
     files = _picture_names([safe_name(view.name, cameras or map_path) for view in views])  # no path outside `output`
     folders = {kind: output if len(what) == 1 else output / kind for kind in what}
-    refuse_inputs((folder / file for folder in folders.values() for file in files), [map_path, *_listed(cameras)])
+    listed = [] if cameras is None else [cameras.parent / name for name, _, _ in read_frames(cameras)]
+    inputs = [map_path, cameras, *listed, *(photo.with_name(f"{photo.name}.png") for photo in listed)]
+    refuse_inputs((folder / file for folder in folders.values() for file in files), inputs)
     gaussians = as_gaussians(gmap)
     for kind, folder in folders.items():
         for file, view in zip(files, views, strict=True):
@@ -71,14 +69,6 @@ def _picture_names(names: list[str]) -> list[str]:
     short = [str(Path(name).with_suffix("")) if Path(name).suffix.lower() in SUFFIXES else name for name in names]
     many = Counter(short)
     return [f"{name if many[stem] > 1 else stem}.png" for name, stem in zip(names, short, strict=True)]
-
-
-def _listed(cameras: Path | None) -> list[Path]:
-    """A transforms.json and the photos it lists, whether they exist or not."""
-    if cameras is None:
-        return []
-    photos = [cameras.parent / name for name, _, _ in read_frames(cameras)]
-    return [cameras, *photos, *(photo.with_name(f"{photo.name}.png") for photo in photos)]
 
 
 def rendered_crop(gmap: QueryMap, instance_id: int, side: int) -> np.ndarray | None:

@@ -41,11 +41,8 @@ def list_edges(lists: np.ndarray) -> np.ndarray:
 
 
 def scannet_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Vertex normals [P, 3] float32 of ScanNet's segmentator: the running mean of the unit normals of a vertex's faces.
-
-    Each face counts alike, and the mean is not scaled to length 1: it is short at a crease. Bit for bit the program's
-    arithmetic in float32. Faces without area, which give NaN there, are left out; zero where a vertex has no face.
-    """
+    """Vertex normals [P, 3] float32 of ScanNet's segmentator, bit for bit: the running mean of the unit normals of a
+    vertex's faces, short at a crease. Faces without area, which give NaN there, are left out; zero without faces."""
     corners = points[faces].astype(np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
         sides = [(corners[:, k] - corners[:, 0]).astype(np.float32) for k in (1, 2)]
@@ -84,11 +81,8 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def step_weights(points: np.ndarray, normals: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """How far each edge (a, b) leaves the planes of its ends, [E] float32: the squared sine of the larger angle.
-
-    0 on a plane, small on a curved surface, near 1 between close parallel surfaces, such as a poster and its wall.
-    Missing (zero) normals are ignored.
-    """
+    """How far each edge (a, b) leaves the planes of its ends, [E] float32: the squared sine of the larger angle, near 1
+    between close parallel surfaces, such as a poster and its wall. Missing (zero) normals are ignored."""
     a, b = edges[:, 0], edges[:, 1]
     chord = (points[b] - points[a]).astype(np.float32)
     off = np.maximum(*(np.einsum("ei,ei->e", normals[end], chord) ** 2 for end in (a, b)))
@@ -100,9 +94,8 @@ def felzenszwalb(
 ) -> np.ndarray:
     """Segment [num_nodes] int32 of each node of a graph, numbered in order of appearance (IJCV 2004).
     edges [E, 2] int32, weights [E]; equal weights are ordered by node numbers, not by position in `edges`."""
-    labels = np.empty(num_nodes, np.int32)
-    edges = np.ascontiguousarray(edges, np.int32)
-    _core.felzenszwalb(edges, np.ascontiguousarray(weights, np.float32), k_threshold, min_size, labels)
+    labels, weights = np.empty(num_nodes, np.int32), np.ascontiguousarray(weights, np.float32)
+    _core.felzenszwalb(np.ascontiguousarray(edges, np.int32), weights, k_threshold, min_size, labels)
     return labels
 
 
@@ -148,16 +141,12 @@ def vote(labels: np.ndarray, segments: np.ndarray) -> np.ndarray:
     labels [P] int32 (−1 = none), segments [P] int32 >= 0. −1 counts like any other label."""
     if len(labels) != len(segments):
         raise InputError(f"{len(segments)} segment ids for {len(labels)} points; they must be the same points in order")
-    if len(labels) == 0:
-        return labels.astype(np.int32)
     pairs = (segments.astype(np.int64) << 32) | (labels.astype(np.int64) + (1 << 31))
     pairs, counts = np.unique(pairs, return_counts=True)
     segment, label = pairs >> 32, (pairs & 0xFFFFFFFF) - (1 << 31)
     order = np.lexsort((label, -counts, segment))
     known, first = np.unique(segment[order], return_index=True)
-    chosen = np.zeros(int(known[-1]) + 1, np.int32)
-    chosen[known] = label[order[first]]
-    return chosen[segments]
+    return label[order[first]].astype(np.int32)[np.searchsorted(known, segments)]
 
 
 def read_segments(path: str | Path, num_points: int) -> np.ndarray:

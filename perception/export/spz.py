@@ -28,10 +28,8 @@ FARTHEST = 1 << 22
 
 def write_spz(path: Path, gmap: Map) -> None:
     """Writes all Gaussians in map order, and their instance ids [N] int32 (−1 = none) beside it as `.npy`, same stem.
-
     Errors: positions 2⁻ᵇ / 2 with b = 12 bits or as many as the map's size leaves, log-scales 1/32, opacities and
-    colours 1/510. InputError as `spz_bytes`.
-    """
+    colours 1/510. InputError as `spz_bytes`."""
     data = spz_bytes(gmap, path)
     write_file(path.with_suffix(".npy"), lambda file: np.save(file, gmap.instance_ids.astype(np.int32)))
     write_file(path, data)

@@ -9,7 +9,7 @@ import sys
 import zipfile
 from pathlib import Path
 from threading import Lock
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 
@@ -54,10 +54,9 @@ def map_npy(file: Path) -> np.ndarray:
     SyntaxError; ValueError for a header that claims more than the file holds."""
     with file.open("rb") as stream:
         shape, fortran, dtype = _header(stream, file.stat().st_size)
-        order: Any = "F" if fortran else "C"
         if not math.prod(shape):
-            return np.empty(shape, dtype, order)
-        return np.memmap(stream, dtype, "r", stream.tell(), shape, order)
+            return np.empty(shape, dtype)
+        return np.memmap(stream, dtype, "r", stream.tell(), shape, "F" if fortran else "C")
 
 
 def _unpacked(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
@@ -83,16 +82,14 @@ def _header(stream: IO[bytes], size: int) -> tuple[tuple[int, ...], bool, np.dty
     version = np.lib.format.read_magic(stream)
     if version not in ((1, 0), (2, 0)):
         raise ValueError(f"array format {version}, expected 1.0 or 2.0")
-    width, read = {
-        1: ("<H", np.lib.format.read_array_header_1_0),
-        2: ("<I", np.lib.format.read_array_header_2_0),
-    }[version[0]]
-    length = stream.read(struct.calcsize(width))
-    (wanted,), left = struct.unpack(width, length), size - stream.tell()
+    first = version == (1, 0)
+    length = stream.read(2 if first else 4)
+    (wanted,), left = struct.unpack("<H" if first else "<I", length), size - stream.tell()
     if wanted > min(left, _MOST_HEADER):
         raise ValueError(f"an array header of {wanted} bytes, {left} are there")
     header = io.BytesIO(length + stream.read(wanted))
     with _ONE_HEADER:
+        read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
         shape, fortran, dtype = read(header)
     if dtype.hasobject or dtype.itemsize == 0 or dtype.fields is not None or dtype.subdtype is not None:
         raise ValueError(f"an array of {dtype}")

@@ -193,10 +193,8 @@ def put_fresh(new: Path, path: Path) -> None:
 def swap(new: Path, path: Path) -> Path | None:
     """Puts folder `new` in place of `path`; returns where the old folder lies then, None if there was none.
 
-    On Linux renameat2 exchanges the two folders in one step, so `path` exists at all times. On other systems the old
-    folder is renamed first, and `path` does not exist between the two renames (microseconds). If the process is killed
-    there, `current(path)` gives readers the old folder; the next writer or `recover(path)` restores it. `path` is never
-    partly written.
+    On Linux renameat2 exchanges the two in one step. On other systems the old folder is renamed first; if the process
+    is killed then, `current(path)` gives readers the old folder, and the next writer or `recover(path)` restores it.
     """
     if not path.exists():
         put_fresh(new, path)
@@ -220,10 +218,10 @@ def exchange(a: Path, b: Path) -> bool:
         call = ctypes.CDLL(None, use_errno=True).renameat2
     except (OSError, AttributeError):
         return False
-    result: int = call(_AT_FDCWD, os.fsencode(a), _AT_FDCWD, os.fsencode(b), _RENAME_EXCHANGE)
-    if result != 0 and ctypes.get_errno() not in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP):
-        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), str(b))
-    return result == 0
+    done = call(_AT_FDCWD, os.fsencode(a), _AT_FDCWD, os.fsencode(b), _RENAME_EXCHANGE) == 0
+    if not done and (code := ctypes.get_errno()) not in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP):
+        raise OSError(code, os.strerror(code), str(b))
+    return bool(done)
 
 
 def _sibling(path: Path, kind: str) -> Path:

@@ -45,13 +45,13 @@ def read_cloud(path: str | Path) -> PointCloud:
     points are float64 where float32 would lose digits; columns besides points, colours and normals become `labels`;
     faces of more than three corners are split into fans. NaN and infinite points are kept in place. Memory at its peak
     is at most three times the size of the file (`python tools speed.readers`)."""
-    path = Path(path)
-    if path.suffix.lower() not in _FORMATS:
+    path, kind = Path(path), Path(path).suffix.lower()
+    if kind not in _FORMATS:
         raise InputError(f"{path}: unknown point cloud format '{path.suffix}'; expected {', '.join(_FORMATS)}")
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; expected a point cloud")
     require_memory(3 * path.stat().st_size, str(path), "split the cloud, or use a machine with more memory")
-    cloud = _FORMATS[path.suffix.lower()][0](path)
+    cloud = _FORMATS[kind][0](path)
     if len(cloud.points) == 0:
         raise InputError(f"{path}: holds no points")
     return cloud
@@ -160,11 +160,10 @@ def _columns_of(cloud: PointCloud, normals: tuple[str, ...]) -> dict[str, np.nda
 
 def _read_ply_cloud(path: Path) -> PointCloud:
     elements = read_ply(path)
-    vertex, face = elements.get("vertex", {}), elements.get("face", {})
-    cloud = _cloud_of(vertex, path)
-    for name in ("vertex_indices", "vertex_index"):
-        if name in face:
-            cloud.faces = _triangles(face[name], len(cloud.points), path)
+    cloud, face = _cloud_of(elements.get("vertex", {}), path), elements.get("face", {})
+    corners = face.get("vertex_index", face.get("vertex_indices"))
+    if corners is not None:
+        cloud.faces = _triangles(corners, len(cloud.points), path)
     return cloud
 
 
@@ -250,8 +249,11 @@ def _read_pcd(path: Path) -> PointCloud:
             raise InputError(f"{path}: PCD DATA is '{kind}'; expected ascii, binary or binary_compressed")
         with refusing(f"{path}: PCD cannot be understood ({{why}})"):
             table = _pcd_table(header, left if kind == "binary" else None)
-            if kind == "binary_compressed":
-                columns = _by_column(_unpacked(file, path), table)
+            if kind == "binary_compressed":  # one column after another
+                data, columns, at = _unpacked(file, path), Element(), 0
+                for p in table.properties:
+                    columns[p.name] = np.frombuffer(data, f"<{p.kind}", table.rows, at)
+                    at += table.rows * int(p.kind[1:])
         if kind != "binary_compressed":
             columns = read_body(path, file, "<" if kind == "binary" else "", [table])[table.name]
     return _cloud_of({name: values for name, values in columns.items() if not name.startswith("_")}, path)
@@ -280,15 +282,6 @@ def _pcd_table(header: dict[str, list[str]], held: int | None) -> Table:
     if len(rows) != 1 or not 0 <= min(rows) <= MOST_ROWS:
         raise ValueError(f"POINTS and WIDTH × HEIGHT are {' and '.join(map(str, sorted(rows))) or 'not given'}")
     return Table("points", rows.pop(), columns)
-
-
-def _by_column(data: bytes, table: Table) -> Element:
-    """The columns of a table that stores one after another."""
-    columns, at = Element(), 0
-    for p in table.properties:
-        columns[p.name] = values = np.frombuffer(data, f"<{p.kind}", table.rows, at)
-        at += values.nbytes
-    return columns
 
 
 def _unpacked(file: BinaryIO, path: Path) -> bytes:
@@ -326,15 +319,14 @@ def _write_pcd(path: Path, cloud: PointCloud) -> None:
     if cloud.colors is not None:
         r, g, b = cloud.colors.astype(np.uint32).T
         columns["rgb"] = ((r << 16) | (g << 8) | b).view(np.float32)
-    columns |= storable(cloud.labels)[0]
-    rows = packed(columns)
-    kinds = [rows.dtype[name] for name in columns]
+    rows = packed(columns | storable(cloud.labels)[0])
+    kinds = [rows.dtype[name] for name in rows.dtype.names or ()]
     header = (
         "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\n"
-        f"FIELDS {' '.join(columns)}\n"
+        f"FIELDS {' '.join(rows.dtype.names or ())}\n"
         f"SIZE {' '.join(str(kind.itemsize) for kind in kinds)}\n"
         f"TYPE {' '.join(kind.kind.upper() for kind in kinds)}\n"
-        f"COUNT {' '.join('1' for _ in columns)}\n"
+        f"COUNT {' '.join('1' for _ in kinds)}\n"
         f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\nDATA binary\n"
     )
     with atomic_file(path) as new, new.open("wb") as file:

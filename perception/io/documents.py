@@ -1,6 +1,4 @@
-"""Parses untrusted JSON and YAML files, and checks names of photos in them before paths are made from these; all errors
-are an InputError with a one-line message.
-"""
+"""Parses untrusted JSON and YAML files, and checks names of photos in them before paths are made from these."""
 
 from __future__ import annotations
 
@@ -72,12 +70,8 @@ _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
 def safe_name(name: object, source: object) -> str:
-    """`name` itself when it is a relative path that stays below the folder it is joined to ("a/0001.jpg").
-
-    source: the file or folder that gave the name, for the message. Both "/" and "\\" count as separators.
-    InputError if it is not a string, for an empty name, an absolute path, a drive letter, a part "..", and for control
-    characters (NUL, newline) and lone surrogates, which line-based files and terminals cannot hold.
-    """
+    """`name` itself when it is a relative path that stays below the folder it is joined to ("a/0001.jpg"), InputError
+    for what `what_is_wrong` tells. source: the file or folder that gave the name, for the message."""
     wrong = what_is_wrong(name)
     if wrong is None:
         return str(name)
@@ -88,7 +82,8 @@ def safe_name(name: object, source: object) -> str:
 
 
 def what_is_wrong(name: object) -> str | None:
-    """Why `safe_name` refuses a name; None if it does not."""
+    """Why `safe_name` refuses a name; None if it does not. Both "/" and "\\" count as separators; line-based files and
+    terminals cannot hold control characters (NUL, newline) and lone surrogates."""
     if not isinstance(name, str):
         return f"is {type(name).__name__}, not text"
     parts = _SEPARATOR.split(name)

@@ -1,8 +1,4 @@
-"""Shapes of JSON files, checked when they are read: kinds of values, and a check that names the wrong key.
-
-A shape is {key: shape}, where a key with "?" may be missing, [shape] for a list, or a type. Keys that are not named are
-kept as they are.
-"""
+"""Shapes of JSON files (`typed`), checked when they are read: kinds of values, and a check that names the wrong key."""
 
 from __future__ import annotations
 
@@ -78,13 +74,8 @@ Number = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
 Length = Annotated[float, Field(ge=0, le=FARTHEST)]
 Positive = Annotated[float, Field(gt=0, le=FARTHEST)]
 Share = Annotated[float, Field(ge=0, le=1)]
-Text = Annotated[
-    str,
-    _expecting(
-        "text, found half of a surrogate pair",
-        lambda value: value.isprintable() or not re.search(r"[\ud800-\udfff]", value),
-    ),
-]
+_SURROGATE = re.compile(r"[\ud800-\udfff]")
+Text = Annotated[str, _expecting("text, found half of a surrogate pair", lambda text: not _SURROGATE.search(text))]
 Moment = Annotated[str, AfterValidator(_moment)]
 PathText = Annotated[Any, _expecting("a path", lambda value: isinstance(value, str) and "\0" not in value)]
 FileName = Annotated[str, _expecting("the name of a file", lambda name: Path(name).name == name and "\0" not in name)]
@@ -100,8 +91,9 @@ Pose = Annotated[Similarity, _expecting("a rigid transform", lambda matrix: abs(
 
 
 def typed(shape: Any) -> Any:
-    """The type that a shape below describes: {key: shape}, a key with "?" may be missing; [shape]: a list; or a type.
-    Typed dictionaries are checked several times faster than models, and a map has many instances."""
+    """The type that a shape describes: {key: shape}, where a key with "?" may be missing and others are kept as they
+    are; [shape]: a list; or a type. Typed dictionaries are checked several times faster than models, and a map has many
+    instances."""
     if isinstance(shape, list):
         return list[typed(shape[0])]  # type: ignore[misc]
     if not isinstance(shape, dict):

@@ -24,9 +24,8 @@ Keep = Callable[[np.ndarray], np.ndarray]
 class DiskArrays:
     """Keeps arrays, those of the first `limit` / 2 bytes in memory, the others in unnamed mapped files of `folder`.
 
-    A thread drops the files' pages from memory when more than `limit` / 2 bytes of them are resident. Left to the
-    system alone, as np.memmap does, 1,000 photos with a limit of 300 MiB peak at 2,308 MiB instead of 882, and 300 at
-    1,174 instead of 880 (`python tests/pipeline/test_memory.py tabletop_a --photos 300 1000 --memory 300M`). It is safe
+    A thread drops the files' pages from memory when more than `limit` / 2 bytes of them are resident; left to the
+    system alone, as np.memmap does, 1,000 photos with a limit of 300 MiB peak at 2,308 MiB instead of 882. It is safe
     at any time: the numbers are in the file, and mostly in the system's cache, from which a page returns in less than a
     microsecond. Files vanish with the last array, or with the process. OSError when the disk is full. beside: others,
     whose arrays fill the same limit.

@@ -58,9 +58,8 @@ def fuse_depth(shots: Iterable[Shot], voxel: float) -> tuple[np.ndarray, np.ndar
         image = o3d.t.geometry.Image(tensor(np.ascontiguousarray(depth)))
         picture = o3d.t.geometry.Image(tensor(np.ascontiguousarray(colors)))
         far = (1.0, 2.0 * float(depth.max()), 4.0)  # unit, farthest depth, truncation
-        grid.integrate(
-            grid.compute_unique_block_coordinates(image, *camera, *far), image, picture, camera[0], *camera, *far
-        )
+        blocks = grid.compute_unique_block_coordinates(image, *camera, *far)
+        grid.integrate(blocks, image, picture, camera[0], *camera, *far)
     mesh = grid.extract_triangle_mesh(1.5)
     if len(mesh.vertex.positions) == 0:
         raise InputError(f"no surface is found with voxels of {voxel:g}; choose another --voxel-size")

@@ -11,7 +11,8 @@ import struct
 import warnings
 from array import array
 from codecs import BOM_UTF8
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -74,19 +75,21 @@ def read_ply(path: str | Path) -> dict[str, Element]:
     A scalar property is an array [rows]; a list property is [rows, k] when all its lists have the same length k, and
     `Lists` otherwise. Arrays may be read-only views of the file's bytes. Of properties of one name the first counts."""
     path = Path(path)
-    try:
-        with path.open("rb") as file:
-            order, tables = _read_header(file, path)
-            return read_body(path, file, order, tables)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); expected a PLY file") from error
+    with _opened(path) as file:
+        return read_body(path, file, *_read_header(file, path))
 
 
 def ply_tables(path: Path) -> list[Table]:
     """The elements that the header of a PLY file lists."""
+    with _opened(path) as file:
+        return _read_header(file, path)[1]
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
     try:
         with path.open("rb") as file:
-            return _read_header(file, path)[1]
+            yield file
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); expected a PLY file") from error
 

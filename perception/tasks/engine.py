@@ -37,9 +37,9 @@ except InputError as error:
 def _join(ray: Any, address: str | None) -> None:
     """Connects this process to the cluster at `address`, or starts one, which no other machine reaches.
 
-    Workers import from the driver's current folder first. It may be a clone without compiled core, or writable for
-    others; so it is Python's own meanwhile, which holds no modules. The sockets of a cluster that Ray starts listen on
-    the loopback address where its clusters are of one machine, as by default on all systems but Linux.
+    Workers import from the driver's current folder first, which may be a clone without compiled core, or writable for
+    others; so it is Python's own meanwhile. The sockets of a cluster that Ray starts listen on the loopback address
+    where its clusters are of one machine, as by default on all systems but Linux.
     """
     options = {"ignore_reinit_error": True, "log_to_driver": False, "logging_level": logging.ERROR}
     before, constants = Path.cwd(), ray._private.ray_constants
