@@ -214,9 +214,6 @@ class Control:
         for callback in list(self.callbacks):
             callback(SimpleNamespace(client=self))
 
-    def send_file_download(self, name: str, content: bytes) -> None:
-        assert content.startswith(b"ply\n")
-
     def add_notification(self, *_: Any, **__: Any) -> None: ...
 
     def __enter__(self) -> Control:
