@@ -122,7 +122,9 @@ def segment_cloud(cloud: PointCloud, scannet: bool = False) -> np.ndarray:
         lists = neighbor_lists(points, NORMAL_NEIGHBORS)
         edges, normals = list_edges(lists[:, : NEIGHBORS + 1]), list_normals(points, lists)
     if cloud.normals is not None and not scannet:
-        normals = np.nan_to_num(cloud.normals)
+        normals = np.nan_to_num(cloud.normals, posinf=0, neginf=0)
+        length = np.linalg.norm(normals, axis=1, keepdims=True)  # sums of faces' normals, or bytes
+        normals = np.where(np.abs(length - 1) > 1e-3, normals / np.maximum(length, 1e-12), normals)
     weights = scannet_weights(points, normals, edges, oriented=meshed or cloud.normals is not None)
     if not meshed and cloud.normals is not None:  # meshes have no edges across gaps; estimated normals show steps
         weights += _STEP_WEIGHT * step_weights(points, normals, edges)

@@ -258,6 +258,17 @@ def test_floor_and_wall_are_two_segments(graph):
     assert len(np.unique(bare[: len(points) // 2])) < 6
 
 
+@pytest.mark.parametrize("length", [0.5, 127.0, "areas"])
+def test_normals_of_any_length_give_the_same_segments(length):
+    """MeshLab writes sums of the faces' normals, other programs bytes."""
+    rng = np.random.default_rng(0)
+    plane, normals = rng.uniform(0, 1, (1600, 2)), np.repeat([[0.0, 0, 1], [0, 1, 0]], 800, axis=0)
+    points = np.insert(plane[:800], 2, 0, axis=1), np.insert(plane[800:], 1, 0, axis=1)
+    scale = rng.uniform(0.01, 3, (1600, 1)) if length == "areas" else length
+    segments = segment_cloud(PointCloud(np.concatenate(points), normals=(scale * normals).astype(np.float32)))
+    assert segments.tolist() == [0] * 800 + [1] * 800
+
+
 def test_colour_keeps_a_poster_from_its_wall():
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.random((4000, 2)), np.zeros((4000, 1))], axis=1)
