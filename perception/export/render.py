@@ -39,12 +39,12 @@ def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[st
     """Writes one image per camera and kind: `NAME.png` for a single kind, `KIND/NAME.png` for several. NAME is that of
     the photo without its suffix, or with it where another photo has the same otherwise.
 
-    rgb: 8-bit PNG. depth: 16-bit PNG, thousandths of the map's unit along the optical axis, 0 = nothing. instances:
-    16-bit PNG of id + 1, 0 = none. features: 8-bit PNG of the three main components.
-    cameras: a transforms.json in the coordinates of the map's input, or one of `localise`; None takes the map's
-    held-out views (all views if none were held out). A camera with lens distortion is rendered with that distortion, so
-    that the image aligns with its photo. InputError for a name that points outside `output`, and for an image that
-    would replace a photo.
+    rgb: 8-bit PNG. depth: 16-bit PNG, thousandths of the map's unit along the optical axis, 0 = nothing, or beyond the
+    65.535 units that 16 bits hold. instances: 16-bit PNG of id + 1, 0 = none. features: 8-bit PNG of the three main
+    components. cameras: a transforms.json in the coordinates of the map's input, or one of `localise`; None takes the
+    map's held-out views (all views if none were held out). A camera with lens distortion is rendered with that
+    distortion, so that the image aligns with its photo. InputError without views, for a name that points outside
+    `output`, and for an image that would replace a photo.
     """
     if wrong := [kind for kind in what if kind not in KINDS]:
         raise InputError(f"--what: found '{wrong[0]}', expected one of: {', '.join(KINDS)}")
@@ -52,6 +52,8 @@ def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[st
     views = map_views(gmap) if cameras is None else _cameras(cameras)
     if cameras is not None and not in_map_frame(cameras, gmap.info, gmap.views):
         views = [moved(view, map_from_input(map_path, gmap.info)) for view in views]
+    if not views:
+        raise InputError(f"{map_path if cameras is None else cameras}: holds no views; give others with --cameras FILE")
     files = _picture_names([safe_name(view.name, cameras or map_path) for view in views])  # no path outside `output`
     folders = {kind: output if len(what) == 1 else output / kind for kind in what}
     listed = [] if cameras is None else [cameras.parent / name for name, _, _ in read_frames(cameras)]
@@ -129,7 +131,8 @@ def _picture(kind: str, gaussians: Gaussians, gmap: Map, view: View) -> np.ndarr
         return (found.ids + 1).astype(np.uint16)
     if kind == "depth":
         depth = depth_image(gaussians, pose, K, view.width, view.height)
-        return (depth * 1000).round().clamp(0, 65535).numpy().astype(np.uint16)
+        thousandths = (depth * 1000).round().numpy()
+        return np.where(thousandths <= 65535, thousandths, 0).astype(np.uint16)
     if kind == "rgb":
         return rgb_image(gaussians, pose, K, view.width, view.height)
     out = render(gaussians, pose, K, view.width, view.height, features=gaussians.features)

@@ -68,6 +68,23 @@ def test_photos_beside_the_camera_files_folder_are_rendered_below_the_output(tmp
     assert picture is not None and picture.shape == (24, 32, 3)
 
 
+def test_depth_that_16_bits_do_not_hold_is_none(tmp_path: Path) -> None:
+    for z, held in ((60.0, 60_000), (66.0, 0)):
+        gmap = small_map(3)
+        gmap.means, gmap.log_scales[:], gmap.opacity_logits[:] = np.array([[0, 0, z]] * 3, np.float32), 2.0, 9.0
+        write_map(tmp_path / "m.gsmap", gmap)
+        render_map(tmp_path / "m.gsmap", tmp_path / "out", camera_file(tmp_path, ["a.jpg"]), ["depth"])
+        assert abs(int(cv2.imread(str(tmp_path / "out" / "a.png"), cv2.IMREAD_UNCHANGED)[12, 16]) - held) <= 1
+
+
+def test_a_map_without_views_is_told(tmp_path: Path) -> None:
+    gmap = small_map(20)
+    gmap.views = []
+    write_map(tmp_path / "m.gsmap", gmap)
+    with pytest.raises(InputError, match="holds no views"):
+        render_map(tmp_path / "m.gsmap", tmp_path / "out", None, ["rgb"])
+
+
 def test_a_fisheye_lens_of_any_width_shows_what_a_pinhole_shows_up_to_79_degrees(tmp_path: Path) -> None:
     """r = f θ (equidistant) against tan θ; at the corners θ is 254°, whose pinhole image has no end."""
     write_map(tmp_path / "m.gsmap", small_map(400))
