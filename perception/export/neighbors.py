@@ -18,8 +18,8 @@ CHUNK = 1 << 20  # points at a time: 24 MiB of working memory
 
 
 class Neighbors:
-    """A k-d tree over the finite ones of points [N, 3] (any float dtype). Far from the origin, the centre of the cloud
-    is subtracted in float64 first, so that georeferenced coordinates keep their precision."""
+    """A k-d tree over the finite ones of points [N, 3] (any float dtype). Far from the origin, the median is subtracted
+    in float64 first, so that georeferenced coordinates keep their precision, also beside outliers such as (0, 0, 0)."""
 
     def __init__(self, points: np.ndarray, threads: int | None = None) -> None:
         finite = np.isfinite(np.asarray(points)).all(axis=-1)
@@ -27,10 +27,10 @@ class Neighbors:
             raise InputError(f"expected at least one finite point as [N, 3]; found an array {list(np.shape(points))}")
         self.rows = np.flatnonzero(finite).astype(np.int32)
         points = np.asarray(points)[self.rows] if len(self.rows) < len(points) else np.asarray(points)
-        low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
-        # Coordinates small relative to the extent are not moved: the difference of two close floats is exact.
-        small = np.maximum(np.abs(low), np.abs(high)).max() <= 4 * (high - low).max()
-        self.center = np.zeros(3) if small else (low + high) / 2
+        middle = np.median(points, axis=0).astype(np.float64)
+        spread = np.median(np.abs(points - middle), axis=0).max()
+        # Coordinates small relative to the spread are not moved: the difference of two close floats is exact.
+        self.center = np.zeros(3) if np.abs(middle).max() <= 16 * spread else middle
         self.threads = threads or cores()
         self._tree = _core.KdTree(self.local(points), self.threads)
 
@@ -72,7 +72,8 @@ def list_normals(points: np.ndarray, lists: np.ndarray) -> np.ndarray:
     """Normals [P, 3] float32 of the planes through the neighbour lists [P, k] of points [P, 3]: the direction of least
     variance of a point and its neighbours, of arbitrary sign; zero where they span no plane."""
     normals = np.empty((len(points), 3), np.float32)
-    first = np.flatnonzero(np.isfinite(points).all(axis=1))[:1]
-    local = (points - points[first].sum(axis=0)).astype(np.float32)  # relative to some point, to keep float32 precision
+    finite = points[np.isfinite(points).all(axis=1)]
+    middle = np.median(finite, axis=0) if len(finite) else np.zeros(3)  # subtracted to keep float32 precision
+    local = (points - middle).astype(np.float32)
     _core.plane_normals(local, np.ascontiguousarray(lists), normals, cores())
     return normals

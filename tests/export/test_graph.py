@@ -11,6 +11,7 @@ from scipy.spatial import Delaunay
 
 from perception.errors import InputError
 from perception.export import neighbors
+from perception.export.export_map import export_labels
 from perception.export.neighbors import Neighbors, list_normals, nearest_gaussian, neighbor_lists
 from perception.export.smooth import (
     felzenszwalb,
@@ -267,6 +268,18 @@ def test_normals_of_any_length_give_the_same_segments(length):
     scale = rng.uniform(0.01, 3, (1600, 1)) if length == "areas" else length
     segments = segment_cloud(PointCloud(np.concatenate(points), normals=(scale * normals).astype(np.float32)))
     assert segments.tolist() == [0] * 800 + [1] * 800
+
+
+@pytest.mark.parametrize("outlier", [[0.0, 0, 0], [1e7, -1e7, 3]])
+def test_one_point_far_away_changes_nothing_for_georeferenced_ones(outlier):
+    """Missing returns are written as zeros; float32 resolves half a metre at UTM's northings."""
+    rng, offset = np.random.default_rng(0), np.array([691234.5, 5334567.25, 512])
+    means, points = rng.normal(size=(300, 3)), rng.normal(size=(2000, 3))
+    points[:, 2] = np.round(points[:, 2])  # planes
+    ids = np.arange(300, dtype=np.int32) % 7
+    plain = export_labels(means, ids, PointCloud(points))
+    far = PointCloud(np.concatenate([[outlier], points + offset]))
+    np.testing.assert_array_equal(export_labels(means + offset, ids, far)[1:], plain)
 
 
 def test_colour_keeps_a_poster_from_its_wall():
