@@ -118,6 +118,8 @@ class Registration:
         if not similar and scan_extent > LARGEST_SCAN * self.extent:
             ratio = f"it is {scan_extent / self.extent:.0f} times as large as the map, whose unit is the metre"
             raise InputError(f"scan: {ratio}; give it in metres, or cut it to what the map shows")
+        near = np.linalg.norm(raw, axis=1) <= scan_extent  # stray points would widen the grid of the correlation
+        raw, rows = raw[near], rows[near]
         unit = self.extent / scan_extent if similar else 1.0
         self.scales = unit * SCALES if similar else np.ones(1)
         self.tolerance = TOLERANCE * self.extent
