@@ -176,7 +176,8 @@ def _upgrade(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
     facts = upgrade_map(args.map, args.output, progress=Progress(quiet=args.json))
     before, after = facts["encoder"]
-    change = f"embeddings by {after}, before by {before}" if before != after else "embeddings as they were"
+    kept = "holds no embeddings, so none were made anew" if after is None else "embeddings as they were"
+    change = f"embeddings by {after}, before by {before}" if before != after else kept
     return facts, f"{facts['map']}: {change}"
 
 

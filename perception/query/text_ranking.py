@@ -77,9 +77,8 @@ class TextRanking:
 
     def _make(self) -> Ranker:
         if not self._gmap.language:
-            raise InputError(
-                f"{self._gmap.path}: holds no language embeddings; map again with an encoder (language.encoder=…)"
-            )
+            todo = "name things by perception label, or map again with --set language.encoder=conse or clip:FOLDER"
+            raise InputError(f"{self._gmap.path}: holds no language embeddings; {todo}")
         descriptions, identity = from_arrays(self._gmap.language)
         encoder = encoder_of(self._gmap, self._encoders)
         if encoder is None:

@@ -102,9 +102,12 @@ def _next_step(path: Path, info: dict[str, Any]) -> str:
     if not info["num_instances"]:
         return "no instance was found; give masks (perception map --masks) or more photos"
     name = shell_word(path)
-    if not info.get("metric"):
-        return f'perception scale {name} --known-length "METRES: ID, ID" for metres; perception query {name} "mug"'
-    return f'perception query {name} "mug", or perception view {name}'
+    if info.get("instances", {}).get("encoder", "") is None:
+        use = f"perception view {name} to name things: it was mapped without an encoder, and knows no other words"
+    else:
+        use = f'perception query {name} "mug", or perception view {name}'
+    scale = f'perception scale {name} --known-length "METRES: ID, ID" for metres; '
+    return use if info.get("metric") else scale + use
 
 
 def frame_lines(info: dict[str, Any]) -> list[str]:

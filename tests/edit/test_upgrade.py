@@ -19,6 +19,7 @@ from perception.map.files import read_info
 from perception.map.write import FORMAT_VERSION, read_map, verify_map, write_map
 from support.color_encoder import THINGS, ColorEncoder, encoders
 from support.paths import MAPS
+from support.synthetic_map import write_synthetic_map
 
 RELEASED = MAPS / f"v{FORMAT_VERSION}.gsmap"
 
@@ -157,3 +158,15 @@ def test_upgrade_reads_texts_and_prompts_use_them(
 
 def test_upgrade_on_the_command_line(old: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["upgrade", str(old), "-o", str(old)]) == 2 and "exists already" in capsys.readouterr().err
+
+
+def test_a_map_without_embeddings_stays_without_and_says_what_to_do(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "plain.gsmap"
+    write_synthetic_map(path, ["mug"], None, gaussians=100)
+    assert main(["upgrade", str(path)]) == 0 and "holds no embeddings" in capsys.readouterr().out
+    assert main(["query", str(path), "mug"]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1 and "perception label" in told and "language.encoder=conse" in told
+    assert main(["label", str(path), "0", "mug"]) == 0 and main(["query", str(path), "mug"]) == 0

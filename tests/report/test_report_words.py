@@ -75,3 +75,10 @@ def test_the_next_command_can_be_copied_for_any_name(name: str) -> None:
     line = info_text(Path(name), info).splitlines()[2].removeprefix("next: ").partition(", or")[0]
     args = build_parser().parse_args(shlex.split(line)[1:])
     assert (args.command, args.map, args.text) == ("query", Path(name), ["mug"])
+
+
+def test_who_has_no_encoder_is_told_to_name_things() -> None:
+    info = {"num_gaussians": 9, "num_instances": 6, "sh_degree": 1, "metric": True, "views": []}
+    line = info_text(Path("k.gsmap"), {**info, "instances": {"encoder": None}}).splitlines()[2]
+    args = build_parser().parse_args(shlex.split(line.removeprefix("next: ").partition(" to ")[0])[1:])
+    assert (args.command, args.map) == ("view", Path("k.gsmap")) and "query" not in line
