@@ -83,7 +83,7 @@ def export_mesh(
         vertices = points + origin if origin.any() else points
         write_cloud(output, PointCloud(vertices, colors, None, faces, {"instance_id": labels}))
     facts = {"vertices": len(points), "faces": len(faces), "voxel_size": size, "method": method, "unit": _unit(gmap)}
-    return facts, f"{output}: {len(faces)} triangles, {method}, voxels of {size:.4g} {facts['unit']}"
+    return facts, f"{output}: {len(faces)} triangles, {method}, voxels of {size:.4g} {_unit(gmap, 'map units')}"
 
 
 def export_voxels(gmap: Map, output: Path, voxel: float | None) -> tuple[dict[str, Any], str]:
@@ -116,7 +116,7 @@ def export_voxels(gmap: Map, output: Path, voxel: float | None) -> tuple[dict[st
     write_file(output, lambda file: np.savez(file, **arrays))
     shares = {name: float((state == value).mean()) for name, value in (("free", FREE), ("occupied", OCCUPIED))}
     facts = {"shape": list(state.shape), "voxel_size": size, "unit": _unit(gmap), **shares}
-    text = f"{output}: {' x '.join(map(str, state.shape))} voxels of {size:.4g} {facts['unit']}, "
+    text = f"{output}: {' x '.join(map(str, state.shape))} voxels of {size:.4g} {_unit(gmap, 'map units')}, "
     return facts, text + f"{shares['free']:.0%} free, {shares['occupied']:.1%} occupied, the rest unknown"
 
 
@@ -134,8 +134,8 @@ def _origin(gmap: Map) -> np.ndarray:
     return -pose[:3, 3] if np.array_equal(pose[:3, :3], np.eye(3)) else np.zeros(3)
 
 
-def _unit(gmap: Map) -> str:
-    return "m" if gmap.metric else "unknown"
+def _unit(gmap: Map, unknown: str = "unknown") -> str:
+    return "m" if gmap.metric else unknown
 
 
 def grid_shape(low: np.ndarray, high: np.ndarray, voxel: float, each: int = SPACE_BYTES) -> tuple[int, int, int]:

@@ -15,6 +15,7 @@ from perception.export.mesh import (
     centres,
     check_outputs,
     closed_body,
+    export_voxels,
     grid_shape,
     occupancy,
     signed_distance,
@@ -112,6 +113,13 @@ def test_space_of_a_room_is_free_occupied_or_unknown_as_it_truly_is() -> None:
     brute = np.sqrt(((places[probes, None] - held[None]) ** 2).sum(axis=2)).min(axis=1)
     np.testing.assert_allclose(distance[probes], brute, rtol=1e-5)
     assert np.median(np.abs(distance[probes] - true)) < voxel
+
+
+@pytest.mark.parametrize(("metric", "unit"), [(True, "m"), (False, "map units")])
+def test_the_size_of_voxels_is_told_with_its_unit(tmp_path: Path, metric: bool, unit: str) -> None:
+    facts, line = export_voxels(box_rooms.map_of(FURNISHED, metric=metric), tmp_path / "space.npz", 0.5)
+    assert f"voxels of 0.5 {unit}, " in line
+    assert facts["unit"] == str(np.load(tmp_path / "space.npz")["unit"]) == ("m" if metric else "unknown")
 
 
 @pytest.mark.parametrize("voxel", [0.0, -1.0, np.nan, np.inf])
