@@ -446,7 +446,7 @@ def test_bad_use_ends_with_one_line(
     path = str(write_map_of(tmp_path / "a.gsmap", gaussians=300))
     for words, line in (
         ([str(tmp_path / "none")], "none"),
-        ([path, "--http", "8766"], "host"),
+        ([path, "--http", "8766"], "--http: found '8766', expected HOST:PORT"),
         ([path, "--http", "127.0.0.1:http"], "port: found 'http', expected a whole number from 0 to 65535"),
         ([path, "--http", "0.0.0.0:0"], "token"),
         ([path, "--token-file", str(tmp_path / "none")], "--http HOST:PORT"),
