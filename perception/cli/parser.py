@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.register("type", Path, _path)
+        self._negative_number_matcher = re.compile(r"-([\d.]|[xyz]$)")  # no options: -1, and -y or -0.1,-0.9,0 of --up
 
     def error(self, message: str) -> Any:  # type: ignore[override]
         raise InputError(f"{self.prog}: {message} (see {self.prog} --help)")

@@ -10,6 +10,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from perception.cli import build_parser
 from perception.errors import InputError
 from perception.geometry import camera_centres
 from perception.splats import panoramas
@@ -152,6 +153,12 @@ def test_up_is_read(tmp_path: Path) -> None:
     for text in ("w", "1,2", "0,0,0", "nan,0,1", ""):
         with pytest.raises(InputError, match=r"--up: found"):
             direction(text)
+
+
+@pytest.mark.parametrize("text", ["z", "-y", "0,-0.9,0.1", "-0.1,-.9,0"])
+def test_up_is_a_word_of_its_own_on_the_command_line(text: str) -> None:
+    args = vars(build_parser().parse_args(["map", "scene.ply", "-o", "scene.gsmap", "--up", text, "--resume"]))
+    assert args["splat.up"] == text and args["resume"]
 
 
 @pytest.mark.slow
