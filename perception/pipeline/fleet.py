@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pydantic import Field
+
 from perception.config import MapConfig, Settings, load_config, settings_from
 from perception.errors import InputError, local_path, refuse_named_pipe
 from perception.io.documents import brief, read_yaml
@@ -28,6 +30,7 @@ class Job(Settings):
     output: str
     preset: str = "default"
     config: str | None = None
+    set: dict[Any, Any] = Field(default_factory=dict)
 
 
 def run_fleet(file: Path, engine: Engine, progress: Progress) -> list[dict[str, Any]]:
@@ -51,12 +54,12 @@ def read_jobs(file: Path) -> list[dict[str, Any]]:
             raise InputError(
                 f"{where}: expected 'input: PHOTOS' and 'output: MAP.gsmap', and maybe 'set: {{KEY: VALUE}}'"
             )
-        pairs = [f"{key}={_WORDS.get(str(value), value)}" for key, value in entry.get("set", {}).items()]
-        given = {str(key): (value, where) for key, value in entry.items() if key != "set"}
+        given = {str(key): (value, where) for key, value in entry.items()}
         for key in ("input", "output"):
             if key not in given:
                 raise InputError(f"{where}: has no {key}")
         job = settings_from(Job, given)
+        pairs = [f"{key}={_WORDS.get(str(value), value)}" for key, value in job.set.items()]
         try:
             paths = (file.parent / local_path(text) for text in (job.input, job.output))
             source, output = (Path(os.path.realpath(path)) for path in paths)
