@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -36,7 +38,8 @@ class LabelFolder(MaskSource):
 
     def check(self, views: list[View]) -> list[str]:
         """Checks that every view has a label image of its photo's size. Label images without a view give a warning."""
-        self._files = {view.name: file for view in views if (file := self._find(view, views)) is not None}
+        sharing = Counter(PurePosixPath(view.name).stem for view in views)
+        self._files = {view.name: file for view in views if (file := self._find(view, sharing)) is not None}
         missing = [view.name for view in views if view.name not in self._files]
         if missing:
             advice = "expected a PNG of the same stem for each photo (all zero where nothing is labelled)"
@@ -57,17 +60,18 @@ class LabelFolder(MaskSource):
         """photo: [h, w, 3] undistorted; only its size is used. Returns [h, w] int32."""
         from perception.photos.decode import warp_labels
 
-        file = self._files.get(view.name) or self._find(view, [view])
+        file = self._files.get(view.name) or self._find(view)
         if file is None:
             raise InputError(f"labels:{self.folder}: no label image for photo {view.name}")
         _check_header(file, *view.photo_size)
         height, width = photo.shape[:2]
         return warp_labels(view, read_labels(file), width, height)
 
-    def _find(self, view: View, views: list[View]) -> Path | None:
-        stem = PurePosixPath(safe_name(view.name, f"labels:{self.folder}")).with_suffix(".png")
-        sharing = sum(PurePosixPath(other.name).stem == stem.stem for other in views)
-        return self._named.find(str(stem)) or (self._named.find(stem.name) if sharing == 1 else None)
+    def _find(self, view: View, sharing: Mapping[str, int] | None = None) -> Path | None:
+        """sharing: number of photos of each stem; None: there are no other photos."""
+        name = PurePosixPath(safe_name(view.name, f"labels:{self.folder}")).with_suffix(".png")
+        alone = sharing is None or sharing[name.stem] == 1
+        return self._named.find(str(name)) or (self._named.find(name.name) if alone else None)
 
 
 def _check_header(file: Path, width: int, height: int) -> None:
