@@ -128,10 +128,11 @@ def nested(
     pairs, part = np.unique(segment * np.int64(len(of_region)) + region, return_inverse=True)
     part_probability = of_region[pairs % len(of_region)]
     region, of_region = coarse
-    shared = np.zeros((len(probability), len(of_region)), np.int64)  # voxels of each segment in each region
+    used, region = np.unique(region, return_inverse=True)  # few of all regions of the tree
+    shared = np.zeros((len(probability), len(used)), np.int64)  # voxels of each segment in each region
     np.add.at(shared, (segment, region), 1)
     groups, group = np.unique(shared.argmax(axis=1), return_inverse=True)
-    return Segmentation(points, segment, probability, part, part_probability, group, of_region[groups])
+    return Segmentation(points, segment, probability, part, part_probability, group, of_region[used[groups]])
 
 
 def tree_by(model: MergeModel, graph: SurfaceGraph) -> MergeTree:

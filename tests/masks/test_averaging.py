@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import tracemalloc
+from collections import Counter
+
 import numpy as np
 import pytest
 
 from perception.masks.averaging import averaged
-from perception.masks.merging import Segmentation
+from perception.masks.merging import Segmentation, nested
 
 TRUE = np.repeat([1, 2, 3, 4, 5], [500, 300, 120, 80, 40])
 
@@ -82,3 +85,19 @@ def test_surfaces_with_nothing_or_one_thing(count: int) -> None:
     found = averaged(cuts(segment, np.append(0, np.ones(count))), [(segment, np.append(0, np.ones(count)))])
     np.testing.assert_array_equal(found.segment, segment)
     assert len(found.probability) == count + 1
+
+
+def test_groups_are_the_regions_of_most_voxels_and_take_memory_for_those_of_the_cut_alone() -> None:
+    rng = np.random.default_rng(0)
+    tree, segments = 50_000, 200
+    segment = np.append(np.arange(segments + 1), rng.integers(0, segments + 1, 3000))
+    region = rng.choice(tree, 40, replace=False)[rng.integers(0, 40, len(segment))]
+    odds = rng.random(tree)
+    tracemalloc.start()
+    found = nested(np.zeros((len(segment), 3)), segment, np.ones(segments + 1), (region, odds), (region, odds))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    counts = [Counter(sorted(region[segment == s].tolist())) for s in range(segments + 1)]
+    expected = [odds[max(count, key=lambda r: (count[r], -r))] for count in counts]
+    np.testing.assert_array_equal(found.group_probability[found.group], expected)
+    assert peak < 10e6  # a number for each segment and region of the tree would take 80 MB
