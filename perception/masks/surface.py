@@ -108,9 +108,9 @@ def pixels_of(
 
 
 def position_in(ascending: np.ndarray, keys: np.ndarray) -> np.ndarray:
-    """[P] position of each of keys [P] in `ascending` [V], V ≥ 1; −1 where it is not one of them."""
-    position = np.minimum(np.searchsorted(ascending, keys), len(ascending) - 1)
-    return np.where(ascending[position] == keys, position, -1)
+    """[P] position of each of keys [P] ≥ 0 in `ascending` [V]; −1 where it is not one of them."""
+    position = np.searchsorted(ascending, keys)
+    return np.where(np.append(ascending, -1)[position] == keys, position, -1)
 
 
 def voxel_keys(points: np.ndarray, size: float) -> np.ndarray:

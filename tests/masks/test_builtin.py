@@ -16,7 +16,7 @@ from perception.geometry import move_points
 from perception.masks import compute_masks, load_labels, make_source
 from perception.masks import surface as surface_module
 from perception.masks.builtin import BuiltinSegmentation, fuse, labels_of, surface_graphs
-from perception.masks.cues import depth_cues
+from perception.masks.cues import depth_cues, photo_cues
 from perception.masks.merge_features import PAIR_FEATURES, pair_features
 from perception.masks.merging import (
     REGION_COLUMNS,
@@ -35,7 +35,7 @@ from perception.masks.stereo import (
     measure_depths,
     plane_depths,
 )
-from perception.masks.surface import SurfaceBuilder, pack_voxels, unpack_voxels, voxel_keys
+from perception.masks.surface import Surface, SurfaceBuilder, pack_voxels, unpack_voxels, voxel_keys
 from perception.masks.surface_graph import CONTACT, DEPTH, PIXELS, VOXELS, SurfaceGraph, neighbours, voxel_edges
 from perception.types import DepthImage, View
 from support.mask_scores import best_ious, leaf_sums
@@ -275,6 +275,24 @@ def test_merging_patches_keeps_the_evidence_exact():
             assert first.borders[a][kept[j]][CONTACT] == contacts[into == a][:, into == kept[j]].sum()
             compared += 1
     assert compared > 3
+
+
+def test_things_that_nowhere_touch_are_segments_although_photos_show_them_side_by_side():
+    """A board before a wall, each of one colour: no pair of patches has a border."""
+    side, points = 0.05, np.mgrid[:20, :20, :1].reshape(3, -1).T * 0.05
+    points = np.concatenate([points, points + np.array([1, 0, 2])])
+    keys = voxel_keys(points, side)
+    order, count = np.argsort(keys), len(points)
+    normals, lab = np.tile([0, 0, -1.0], (count, 1)), np.full((count, 3), 100.0)
+    surface = Surface(side, 0.0, keys[order], np.ones(count), points[order], normals, lab, np.zeros(count))
+    patch = (points[order, 2] > 1).astype(np.int32)
+    graph = SurfaceGraph(surface, patch, voxel_edges(surface))
+    regions = np.repeat([[0, 1]], 16, axis=1)[np.zeros(32, int)]
+    photo, depth = photo_cues(np.full((32, 32, 3), 90, np.uint8)), depth_cues(1 + 2.0 * regions, K)
+    graph.add(*graph.evidence(regions, photo, depth, np.zeros((3, 32, 32), np.float32)))
+    graph.link()
+    assert graph.borders == [{}, {}] and graph.sums[:, PIXELS].tolist() == [512, 512]
+    assert len(np.unique(segmentation(graph).segment * 2 + patch)) == 2
 
 
 def test_growth_of_a_union_against_its_voxels():
