@@ -78,7 +78,8 @@ def triangulated_cloud(
     options.num_threads = 1  # the order of sums in several threads is not repeatable
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
     with TemporaryDirectory(dir=store.folder) as out:
-        model = pycolmap.triangulate_points(model, store.database, store.image_root, out, True, options)
+        if len(views) > 1:  # COLMAP refuses one
+            model = pycolmap.triangulate_points(model, store.database, store.image_root, out, True, options)
     points, colors = cloud_of(model)
     error = float(model.compute_mean_reprojection_error()) if len(points) else None
     facts: dict[str, Any] = {"points_from": "triangulated", "mean_reprojection_error_px": error, "warnings": []}

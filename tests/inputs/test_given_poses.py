@@ -102,6 +102,15 @@ def test_blenders_parts_are_one_scene_whose_test_part_is_held_out(tmp_path: Path
     assert [view.held_out for view in alone.views] == [False, False]
 
 
+def test_one_posed_photo_is_a_scene_of_random_points(tmp_path: Path) -> None:
+    data = transforms(tmp_path)
+    del data["ply_file_path"]
+    (tmp_path / "transforms.json").write_text(json.dumps({**data, "frames": data["frames"][:1]}))
+    scene = loaded(tmp_path)
+    check_poses(scene, [0])
+    assert scene.report["points_from"] == "random" and "0 points could be triangulated" in scene.report["warnings"][-1]
+
+
 def test_nerfstudios_lists_are_the_held_out_set(tmp_path: Path) -> None:
     transforms(
         tmp_path, train_filenames=[f"images/{n}" for n in NAMES[:6]], test_filenames=["images/6.png", "images/7.png"]
