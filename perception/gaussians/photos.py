@@ -29,14 +29,19 @@ def split_scene(scene: Scene, options: PhotoConfig) -> tuple[Scene, list[View], 
 
     Held out are the views that the file `options.held_out` names, or those that the input sets apart, or every
     `options.holdout`-th: none with a holdout of 1 or 0, or of fewer than 4 views. InputError for a file that cannot be
-    read or leaves no view to train on.
+    read or leaves no view to train on; names in it of no view are a warning in the scene's report.
     """
     views, listed, every = scene.views, options.held_out, options.holdout
     if listed is not None:
         names = held_out_names(Path(listed))
-        held = [bool(names & {folded(view.name), folded(PurePosixPath(view.name).stem)}) for view in views]
+        own = [{folded(view.name), folded(PurePosixPath(view.name).stem)} for view in views]
+        held = [bool(names & either) for either in own]
         if all(held):
             raise InputError(f"{listed}: names all {len(views)} photos; some must be left to train on")
+        if strange := sorted(names.difference(*own)):
+            found = f"{len(strange)} of {len(names)} names are of no posed photo, such as {strange[0]}"
+            warnings = [*scene.report.get("warnings", []), f"{listed}: {found}; expected names such as {views[0].name}"]
+            scene = replace(scene, report={**scene.report, "warnings": warnings})
     elif every > 1 and 0 < sum(view.held_out for view in views) < len(views):
         held = [view.held_out for view in views]
     else:

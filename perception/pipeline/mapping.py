@@ -74,6 +74,7 @@ def build_map(
         scene = _posed_scene(output, run, splat)
         photos = config.photos if splat is None else config.photos.model_copy(update={"holdout": 0})
         scene, training, held_out = split_scene(scene, photos)
+        _log_scene(scene, progress)
 
         # Masks M_v,i of every photo (§3.2), and Gaussians optimised on photos and masks (§3.1 to 3.2.3).
         if splat is None:
@@ -134,7 +135,6 @@ def _posed_scene(output: Path, run: Run, splat: SplatInput | None) -> Scene:
         if config.losses.depth_weight == 0:
             scene = replace(scene, views=[replace(view, depth=None) for view in scene.views])
     run.inputs = hold_inputs(work, source, config, output)  # the frames of a video among them
-    _log_scene(scene, progress)
     return scene
 
 
