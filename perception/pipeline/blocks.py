@@ -31,7 +31,7 @@ from perception.pipeline.checkpoint import BEFORE_MASKS, CHECKPOINT, digest, loa
 from perception.pipeline.estimate import largest_budget
 from perception.pipeline.optimise import Optimised, Photos, Run, label_by_tasks, label_photos, optimise
 from perception.progress import QUIET, Progress
-from perception.tasks.folder import has_task, read_facts, read_task, write_task
+from perception.tasks.folder import has_task, read_facts, read_task, renew_task
 from perception.types import Scene, View
 
 SAMPLE = 20_000
@@ -222,7 +222,7 @@ def _task(run: Run, scene: Scene, block: Block, config: MapConfig, held: set[str
         for view in views:
             seen |= visible_points(view, scene.points)
         part = replace(scene, views=views, points=scene.points[seen], point_colors=scene.point_colors[seen])
-    write_task(
+    renew_task(
         folder,
         part,
         source=str(run.source.resolve()),

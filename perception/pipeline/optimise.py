@@ -30,7 +30,7 @@ from perception.pipeline.checkpoint import TrainingObserver, digest, training_ma
 from perception.pipeline.estimate import image_memory, largest_budget
 from perception.progress import QUIET, Progress, timed
 from perception.tasks.engine import LOCAL, Engine
-from perception.tasks.folder import has_task, read_task, write_task
+from perception.tasks.folder import read_task, renew_task
 from perception.types import Scene, View
 
 GEOMETRY_START = 0.3
@@ -188,8 +188,7 @@ def label_by_tasks(run: Run, views: Sequence[View], source: MaskSource) -> None:
     for start in range(0, len(views), PHOTOS_A_TASK):
         scene = Scene(list(views[start : start + PHOTOS_A_TASK]), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
         folders.append(run.work / f"labels-{digest(run.mark, source.identity, [view.name for view in scene.views])}")
-        if not has_task(folders[-1]):
-            write_task(folders[-1], scene, config=run.config.to_json(), masks=str(run.masks.resolve()))
+        renew_task(folders[-1], scene, config=run.config.to_json(), masks=str(run.masks.resolve()))
     with run.stage("masks"):
         run.engine.run(label_task, [str(folder.resolve()) for folder in folders], "photo set", run.progress)
 

@@ -26,7 +26,7 @@ from perception.io.atomic import atomic_directory
 from perception.pipeline.checkpoint import digest
 from perception.pipeline.optimise import Optimised, Run
 from perception.progress import QUIET, Progress
-from perception.tasks.folder import RESULT, has_task, read_task, run_tasks, write_task
+from perception.tasks.folder import RESULT, read_task, renew_task, run_tasks
 from perception.types import Scene
 
 PHOTOS_A_TASK = 64
@@ -101,10 +101,9 @@ def _by_tasks(
     for first in range(0, len(views), PHOTOS_A_TASK):
         some = slice(first, first + PHOTOS_A_TASK)
         tasks.append(run.work / f"{name}-{first}")
-        if not has_task(tasks[-1]):
-            scene = Scene(views[some], np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-            paths = {"arrays": [str(folder.resolve()) for folder in folders], "masks": str(run.masks.resolve())}
-            write_task(tasks[-1], scene, config=run.config.to_json(), parts=shown[some], **paths)
+        scene = Scene(views[some], np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+        paths = {"arrays": [str(folder.resolve()) for folder in folders], "masks": str(run.masks.resolve())}
+        renew_task(tasks[-1], scene, config=run.config.to_json(), parts=shown[some], **paths)
     results = run_tasks(run.engine, task, tasks, "photo set", run.progress)
     for file in (file for result in results for file in sorted(result.iterdir())):
         yield read_npz(file, file, f"delete {file.parents[1]} and run again")

@@ -27,6 +27,14 @@ def write_task(folder: Path, scene: Scene | None = None, **facts: Any) -> None:
     write_file(folder / TASK, json.dumps({**facts, "versions": versions()}))
 
 
+def renew_task(folder: Path, scene: Scene | None, **facts: Any) -> None:
+    """`write_task`, or only other facts where a task lies in `folder`. InputError as `read_facts`."""
+    if has_task(folder):
+        read_facts(folder)
+        scene = None
+    write_task(folder, scene, **facts)
+
+
 def has_task(folder: Path) -> bool:
     """Whether a complete task lies in `folder`."""
     return (folder / TASK).is_file()
