@@ -98,7 +98,8 @@ class TrainingObserver:
             if state is None:
                 continue
             if state["masks"] == self.masks or (state["masks"] is None and state["masks_enter"] <= self.masks_enter):
-                trainer.load(state["trainer"])
+                with refusing(f"{self.work / name}: is of another version ({{why}}); delete {self.work} to start over"):
+                    trainer.load(state["trainer"])
                 self.entered = state["masks"] is not None  # also where more time takes progress back before that
                 self.progress.log(f"resuming at iteration {trainer.iteration}")
                 break

@@ -32,6 +32,7 @@ from perception.pipeline.checkpoint import (
     fingerprint,
     load_checkpoint,
     save_checkpoint,
+    training_mark,
     work_folder,
 )
 from perception.pipeline.mapping import build_map
@@ -146,6 +147,20 @@ def test_other_settings_of_the_training_are_refused(small_scene: Path, tmp_path:
         with pytest.raises(InputError, match="other settings"):
             build_map(source, out, settings(small_scene, pair), resume=True)
     assert kept == {name: (work_folder(out) / name).read_bytes() for name in kept}
+
+
+def test_a_checkpoint_of_another_version_is_one_line(small_scene: Path, tmp_path: Path) -> None:
+    """It may lack a figure of the record, or have one more."""
+    source, out, config = small_scene / "transforms.json", tmp_path / "m.gsmap", settings(small_scene)
+    interrupted(source, out, config, 30)
+    file, mark = work_folder(out) / CHECKPOINT, training_mark(source, config)
+    state = load_checkpoint(file, mark)
+    assert state is not None
+    state["trainer"]["record"]["figure_of_tomorrow"] = 1
+    save_checkpoint(file, state, mark)
+    with pytest.raises(InputError, match=r"checkpoint\.pt: is of another version .*figure_of_tomorrow.*; delete "):
+        build_map(source, out, config, resume=True)
+    assert file.is_file()
 
 
 @pytest.mark.parametrize("name", ["images/003.jpg", "labels/003.png", "transforms.json"])
