@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from perception.errors import InputError
@@ -53,12 +54,11 @@ def ssim(prediction: np.ndarray, truth: np.ndarray, weight: np.ndarray | None = 
 
 def read_rgb(path: Path) -> np.ndarray:
     """An image as [H, W, 3] float64 in [0, 1]. 8 or 16 bit; grey is repeated to 3 channels, alpha is dropped."""
-    raw = read_picture(path, path, "8 or 16 bit picture")
-    if raw.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"{path}: holds {raw.dtype}, expected an 8 or 16 bit picture")
-    image = raw[..., None] if raw.ndim == 2 else raw
-    image = np.repeat(image[..., :1], 3, axis=2) if image.shape[2] < 3 else image[..., 2::-1]
-    return image / (255.0 if raw.dtype == np.uint8 else 65535.0)
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    image = read_picture(path, path, "8 or 16 bit picture", flags)
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{path}: holds {image.dtype}, expected an 8 or 16 bit picture")
+    return image[..., ::-1] / (255.0 if image.dtype == np.uint8 else 65535.0)
 
 
 def pictures(folder: str | Path) -> dict[str, Path]:

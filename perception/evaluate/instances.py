@@ -64,8 +64,6 @@ class Matches:
     scores: list[float] = field(default_factory=list)
     positive: list[bool] = field(default_factory=list)
     misses: int = 0
-    has_truth: bool = False
-    has_prediction: bool = False
 
     def add(self, score: float, positive: bool) -> None:
         self.scores.append(score)
@@ -79,8 +77,6 @@ def match(scenes: Sequence[Overlap], label: int, threshold: float, min_region: i
         preds = np.flatnonzero((scene.pred_classes == label) & (scene.pred_sizes >= max(min_region, 1)))
         truths = np.flatnonzero(scene.gt_classes == label)
         big = truths[scene.gt_sizes[truths] >= min_region]
-        result.has_truth |= len(big) > 0
-        result.has_prediction |= len(preds) > 0
         hit = scene.iou > threshold
         _match_truth(scene, preds, big, hit, result)
         small = truths[scene.gt_sizes[truths] < min_region]
@@ -109,11 +105,11 @@ def _match_truth(scene: Overlap, preds: np.ndarray, truths: np.ndarray, hit: np.
 def average_precision(matches: Matches) -> float:
     """Area under the precision-recall curve: one point per distinct score, plus the point (recall 0, precision 1).
 
-    NaN without true instances; 0 without predictions or when all predictions are ignored.
+    NaN without true instances, each of which is matched or missed; 0 without predictions that count.
     """
-    if not matches.has_truth:
+    if not any(matches.positive) and not matches.misses:
         return float("nan")
-    if not matches.has_prediction or not matches.scores:
+    if not matches.scores:
         return 0.0
     scores = np.array(matches.scores)
     order = np.argsort(scores, kind="stable")
@@ -217,7 +213,7 @@ def evaluate_overlaps(scenes: Sequence[Overlap], rules: Protocol) -> dict[str, A
         for j, threshold in enumerate(thresholds):
             table[i, j] = average_precision(match(scenes, label, threshold, rules.min_region))
     mean = _known_mean(table)
-    result: dict[str, Any] = {**_summary(mean, thresholds, len(rules.thresholds))}
+    result: dict[str, Any] = dict(_summary(mean, thresholds, len(rules.thresholds)))
     result["per_threshold"] = [{"iou": round(t, 10), "ap": _number(a)} for t, a in zip(thresholds, mean, strict=True)]
     if rules.by_class:
         rows = {str(c): _summary(row, thresholds, len(rules.thresholds)) for c, row in zip(labels, table, strict=True)}
@@ -275,8 +271,7 @@ def overlap_of_ids(pred_ids: np.ndarray, pred_scores: dict[int, float] | None, t
     missing = [i for i in ids.tolist() if pred_scores is not None and i not in pred_scores]
     if missing:
         raise InputError(f"prediction: no score for instance {missing[0]} ({len(missing)} such); give one for each")
-    scores = [1.0 if pred_scores is None else pred_scores[i] for i in ids.tolist()]
-    confidence = np.asarray(scores, np.float64)
+    confidence = np.array([1.0 if pred_scores is None else pred_scores[i] for i in ids.tolist()], np.float64)
     if not np.isfinite(confidence).all():
         raise InputError(f"prediction: score of instance {ids[~np.isfinite(confidence)][0]} is not a finite number")
     return Overlap(

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from perception.gaussians.device import training_kernels
 from perception.gaussians.model import Gaussians, isotropic, sigmoid
@@ -209,8 +210,6 @@ def _in_holes(
     generator: torch.Generator,
 ) -> Gaussians:
     """One Gaussian for each True block of holes [h, w], by depths of the `covered` ones; tensors like `like`."""
-    from scipy.spatial import cKDTree
-
     known, empty = np.argwhere(covered), np.argwhere(holes)
     known = known[:: max(1, -(-len(known) // MOST_BLOCKS))]
     count = int(np.ceil(NEAREST * len(known)))

@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.views import TrainingView, unprojected
@@ -56,8 +58,6 @@ def start_on_surface(
     points [P, 3], colors [P, 3] uint8: sparse points. None when no depth was measured. At most SHARE of the budget is
     used.
     """
-    from scipy.spatial import cKDTree
-
     most = max(1, int(SHARE * budget))
     cloud = fuse_depth(views, most)
     if cloud is None:
@@ -73,9 +73,6 @@ def start_on_surface(
 
 def _discs(gaussians: Gaussians) -> Gaussians:
     """The Gaussians as discs in the planes of their nearest neighbours, sizes as WIDTH and THICKNESS say."""
-    from scipy.spatial import cKDTree
-    from scipy.spatial.transform import Rotation
-
     means = gaussians.means.double().numpy()
     near = means[cKDTree(means).query(means, k=min(NEIGHBOURS, len(means)))[1].reshape(len(means), -1)]
     offset = near - near.mean(axis=1, keepdims=True)

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from perception.gaussians.densify import rotation_matrices
 from perception.gaussians.model import Gaussians
@@ -27,8 +28,6 @@ class FreeSpace:
     """points [P, 3]: what was measured, here the means of the first Gaussians; views: of the cameras."""
 
     def __init__(self, points: np.ndarray, views: Sequence[TrainingView]):
-        from scipy.spatial import cKDTree
-
         self._measured = cKDTree(points)
         balls = [_ball(points, view) for view in views]
         self._balls = [(center, radius) for center, radius in balls if radius > 0]

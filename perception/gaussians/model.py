@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from perception.colors import rgb_from_sh, sh_from_rgb
 from perception.gaussians.device import training_kernels
@@ -169,8 +170,6 @@ def from_points(
 
     points [P, 3] float; colors [P, 3] uint8. Coincident points get the median scale; all are clipped relative to it.
     """
-    from scipy.spatial import cKDTree
-
     points = np.ascontiguousarray(points, dtype=np.float64)
     neighbours = min(4, len(points))
     if neighbours > 1:

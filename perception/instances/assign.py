@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
+from scipy.spatial import cKDTree
 
 from perception.geometry import nearest
 from perception.masks.votes import MaskVotes
@@ -68,7 +69,6 @@ def reassign(
     voters = np.flatnonzero((ids >= 0) & (opacities >= min_opacity))
     if count == 0 or len(voters) < 2:
         return assigned
-    from scipy.spatial import cKDTree
 
     shares = mask_shares(votes.of_groups(ids, count))
     tree = cKDTree(means[voters])
@@ -96,8 +96,6 @@ def without_strays(ids: np.ndarray, means: np.ndarray, opacities: np.ndarray, mi
     means [N, 3], opacities [N]. A Gaussian is linked to those of its NEIGHBOURS nearest voters (`reassign`) that are of
     its instance. A piece of less than STRAYS Gaussians and STRAY_SHARE of the instance's largest piece gets id −1.
     """
-    from scipy.spatial import cKDTree
-
     rows = np.flatnonzero((ids >= 0) & np.isfinite(means).all(axis=1))
     voters = rows[opacities[rows] >= min_opacity]
     near = min(NEIGHBOURS + 1, len(voters))

@@ -6,6 +6,9 @@ HDBSCAN (Campello et al. 2013) as in the paper (§3.2.1). It finds the number of
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from perception.config import InstanceConfig
 from perception.geometry import nearest
@@ -75,8 +78,6 @@ def _spread(features: np.ndarray, chosen: np.ndarray, labels: np.ndarray, sample
     A row's core distance is its distance to the `samples`-th nearest sampled row. A row joins the cluster of its
     nearest labelled neighbour if its core distance is at most the largest one in that cluster. Otherwise it is noise.
     """
-    from scipy.spatial import cKDTree
-
     sampled = np.zeros(len(features), bool)
     sampled[chosen] = True
     distance, sample = nearest(cKDTree(features[chosen]), features, range(1, samples + 2))
@@ -97,10 +98,6 @@ def split_disconnected(means: np.ndarray, scales: np.ndarray, ids: np.ndarray, s
     at most max(s, twice the sum of their largest scales) and at most 4 s, with s = 3 × the 95th percentile of
     nearest-neighbour distances. Objects that share no photo need this: the loss does not separate their features.
     """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
-
     out = np.full(len(ids), -1, np.int64)
     following = 0
     radius = scales.max(axis=1)

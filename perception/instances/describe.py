@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 
 from perception.instances.crops import crop_levels, mask_box
@@ -81,8 +82,6 @@ def _summary(views: dict[int, Any], dim: int) -> InstanceDescription:
 
 def _color_sample(photo: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Up to COLOR_SAMPLES pixels [P, 3] of the mask without its rim of mixed colours; the full mask if it is thin."""
-    import cv2
-
     inner = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
     pixels = photo[inner] if inner.sum() >= 50 else photo[mask]
     step = max(1, -(-len(pixels) // COLOR_SAMPLES))

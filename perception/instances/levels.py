@@ -7,6 +7,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from perception.geometry import nearest
 from perception.instances.assign import reassign
@@ -44,8 +45,6 @@ def with_levels(grouping: Grouping, means: np.ndarray, votes: MaskVotes, cuts: S
     object, times the IoU of the two in Gaussians, which is low also where voxels are coarse. Instances whose segments
     are one at the coarser cut are a group.
     """
-    from scipy.spatial import cKDTree
-
     rows = np.flatnonzero((grouping.ids >= 0) & np.isfinite(means).all(axis=1))
     if not len(rows) or len(cuts.probability) < 2:
         return grouping

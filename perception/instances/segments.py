@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy import sparse
+from scipy.spatial import cKDTree
 
 from perception.geometry import AT_ONCE, nearest, sums_by
 
@@ -57,8 +58,6 @@ def touching(means: np.ndarray, groups: np.ndarray, count: int) -> sparse.csr_ma
 
     Nearby: among the 7 nearest, and within 3 × max(nearest-neighbour distance of the Gaussian, its median over all).
     """
-    from scipy.spatial import cKDTree
-
     k = min(8, len(means))
     if k < 2:
         return sparse.csr_matrix((count, count), dtype=bool)

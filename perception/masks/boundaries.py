@@ -8,18 +8,15 @@ from __future__ import annotations
 
 import functools
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
+from torch.nn.functional import conv2d, interpolate, relu
 
 from perception.machine import torch_on_one_thread
 from perception.masks.cues import DepthCues, PhotoCues
 
-if TYPE_CHECKING:
-    import torch
-
-    Layers = list[tuple[torch.Tensor, torch.Tensor]]  # weights [out, in, k, k] and offsets [out]
-
+Layers = list[tuple[torch.Tensor, torch.Tensor]]  # weights [out, in, k, k] and offsets [out]
 WEIGHTS = Path(__file__).with_name("boundary_weights.npz")
 REACH = 4  # pixels: whether the pixels this far to either side are of different things is what the network predicts
 INPUTS, OUTPUTS = 11, 3
@@ -30,8 +27,6 @@ _STEP = 0.06  # largest step, relative to depth
 def boundaries(photo: PhotoCues, depth: DepthCues, layers: Layers) -> np.ndarray:
     """[3, h, w] float32 log odds: that the pixels REACH left and right of a pixel are of different things, that those
     above and below are, and that the pixel is of a thing and not of a floor, a wall or a table."""
-    import torch
-
     inputs = scaled(torch.from_numpy(inputs_of(photo, depth))[None])
     with torch_on_one_thread(), torch.inference_mode():  # with more, the last bits of convolutions differ
         odds = forward(layers, inputs)[0].numpy()
@@ -65,9 +60,6 @@ def shapes() -> list[tuple[int, int, int]]:
 def forward(layers: Layers, inputs: torch.Tensor) -> torch.Tensor:
     """[B, 11, h, w] scaled inputs -> [B, 3, h, w] log odds. A U-Net (Ronneberger et al. 2015) from half the resolution
     on, enlarged to the resolution of the inputs."""
-    import torch
-    from torch.nn.functional import conv2d, interpolate, relu
-
     layer = iter(layers)
 
     def two_layers(x: torch.Tensor, stride: int) -> torch.Tensor:
@@ -87,8 +79,6 @@ def forward(layers: Layers, inputs: torch.Tensor) -> torch.Tensor:
 @functools.cache
 def read_layers(file: Path = WEIGHTS) -> Layers:
     """The layers of the package, or of another file of `tools/training`."""
-    import torch
-
     with np.load(file) as stored:
         parts = [torch.from_numpy(stored[f"arr_{k}"].astype(np.float32)) for k in range(len(stored.files))]
     return list(zip(parts[::2], parts[1::2], strict=True))

@@ -9,7 +9,9 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
+from skimage.segmentation import watershed
 
 from perception.errors import InputError
 from perception.geometry import move_points
@@ -40,8 +42,6 @@ class BuiltinSegmentation(MaskSource):
     needs_depth = True
 
     def __init__(self) -> None:
-        import cv2
-
         if not hasattr(cv2, "ximgproc"):
             raise InputError(
                 f"--masks builtin: OpenCV {cv2.__version__} has no ximgproc, so another OpenCV package hides "
@@ -73,8 +73,6 @@ class BuiltinSegmentation(MaskSource):
 
     def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
         """[H, W] int32 labels of `photo` [H, W, 3], after `prepare`. All 0 if the photo does not show the surface."""
-        import cv2
-
         if view.name not in self._labels:
             return np.zeros(photo.shape[:2], np.int32)
         return cv2.resize(self._labels[view.name], photo.shape[1::-1], interpolation=cv2.INTER_NEAREST)
@@ -87,9 +85,6 @@ def labels_of(view: StereoView, segment: np.ndarray) -> np.ndarray:
     confirm its depth and no other segment is within _BAND pixels. Segments grow from there to the borders of the photo,
     and to the learned ones, by a watershed (Meyer 1991).
     """
-    import cv2
-    from skimage.segmentation import watershed
-
     labels = np.where(view.voxel >= 0, segment[view.voxel], 0).astype(np.int32)
     if not (labels > 0).any():
         return labels

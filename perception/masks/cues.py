@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
 _REACH = 4  # pixels to either side, used to measure steps and creases
 _SIDE = 3  # pixels ahead and behind, used to measure tangents
@@ -39,8 +41,6 @@ class DepthCues:
 
 def photo_cues(photo: np.ndarray) -> PhotoCues:
     """photo: [h, w, 3] uint8 RGB."""
-    import cv2
-
     lab = cv2.cvtColor(photo, cv2.COLOR_RGB2LAB).astype(np.float32)
     fine = cv2.GaussianBlur(lab, (0, 0), 1.0)
     edge = 2.0 * _gradient(cv2.GaussianBlur(lab, (0, 0), 2.0))
@@ -49,8 +49,6 @@ def photo_cues(photo: np.ndarray) -> PhotoCues:
 
 def depth_cues(depth: np.ndarray, K: np.ndarray) -> DepthCues:
     """depth: [h, w] z-depth in any unit; 0 or non-finite = none, filled from the nearest pixel. K: [3, 3]."""
-    import cv2
-
     z = cv2.medianBlur(filled_depth(depth), 5)
     z = np.exp(cv2.bilateralFilter(np.log(z), 9, 0.03, 4))  # smooths noise, keeps steps of more than 3 %
     y, x = np.mgrid[: z.shape[0], : z.shape[1]].astype(np.float32) + np.float32(0.5)
@@ -65,8 +63,6 @@ def depth_cues(depth: np.ndarray, K: np.ndarray) -> DepthCues:
 
 def _gradient(image: np.ndarray) -> np.ndarray:
     """[h, w] gradient magnitude over all channels."""
-    import cv2
-
     x, y = cv2.Sobel(image, -1, 1, 0) / 8, cv2.Sobel(image, -1, 0, 1) / 8
     return np.sqrt(_dot(x, x) + _dot(y, y))
 
@@ -81,8 +77,6 @@ def _colour_bins(lab: np.ndarray) -> np.ndarray:
 
 def filled(image: np.ndarray, known: np.ndarray) -> np.ndarray:
     """image [h, w] whose pixels outside `known` take the value of the nearest pixel inside."""
-    from scipy.ndimage import distance_transform_edt
-
     if known.all():
         return image
     return image[tuple(distance_transform_edt(~known, return_distances=False, return_indices=True))]

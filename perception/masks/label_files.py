@@ -6,10 +6,12 @@ import struct
 from pathlib import Path
 
 import numpy as np
+from PIL import Image, PngImagePlugin
 
 from perception.errors import InputError
 from perception.io.atomic import write_file
 from perception.io.documents import safe_name
+from perception.photos.decode import decode, open_photo
 from perception.types import View
 
 LARGEST = 65535
@@ -36,8 +38,6 @@ def load_labels(folder: Path, view: View) -> np.ndarray:
 
 def write_labels(file: Path, labels: np.ndarray, key: str = "") -> None:
     """labels: [h, w] integers ≥ 0. Ids that exceed 16 bit are renumbered from 1."""
-    from PIL import Image, PngImagePlugin
-
     if labels.max(initial=0) > LARGEST:
         unique, inverse = np.unique(labels, return_inverse=True)
         labels = inverse.reshape(labels.shape) + int(unique[0] != 0)
@@ -51,8 +51,6 @@ def write_labels(file: Path, labels: np.ndarray, key: str = "") -> None:
 
 def stored_key(file: Path) -> str | None:
     """The key that a label image was written with; None if the file or the key cannot be read."""
-    from perception.photos.decode import decode, open_photo
-
     try:
         with open_photo(file) as image:
             decode(image, file)
@@ -73,8 +71,6 @@ def read_png_header(file: Path) -> tuple[int, int, int, int]:
 
 def read_labels(file: Path) -> np.ndarray:
     """[H, W] int32. Pillow keeps palette indices, whereas OpenCV converts them to colours."""
-    from perception.photos.decode import decode, open_photo
-
     with open_photo(file) as image:
         decode(image, file)
         labels = np.asarray(image)

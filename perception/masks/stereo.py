@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 
 from perception import _core
@@ -73,8 +74,6 @@ class StereoView:
 
 def make_stereo_view(view: View, photo: np.ndarray, depth: np.ndarray, keep: Keep = np.asarray) -> StereoView | None:
     """photo: [H, W, 3] uint8 RGB; depth: [H, W] prior, 0 = none. Returns None if too few pixels have depth."""
-    import cv2
-
     height, width = photo.shape[:2]
     ratio = SIDE / max(height, width)
     size = (max(1, round(width * ratio)), max(1, round(height * ratio)))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from perception import _core
 from perception.geometry import sums_by
@@ -47,8 +48,6 @@ _UPPER = np.triu_indices(3)
 
 def voxel_edges(surface: Surface) -> np.ndarray:
     """[E, 2] int32, a < b: pairs of nearest-neighbour voxels, at most three voxel sides apart."""
-    from scipy.spatial import cKDTree
-
     k = min(NEIGHBOURS + 1, len(surface))
     distance, near = cKDTree(surface.points).query(surface.points, k=k, distance_upper_bound=3 * surface.size)
     a = np.repeat(np.arange(len(surface)), k)[np.isfinite(distance).ravel()]

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from perception.config import MapConfig
 from perception.errors import InputError
@@ -63,8 +64,6 @@ class Block:
         """[N] bool: of the Gaussians that were trained on photos from centres [C, 3], those whose mean the block owns.
         Not one that leaves the box and is longer (standard deviation) than its distance to the nearest camera: it has
         no place that a linear projection could draw, and only this block's photos saw to it that it hides nothing."""
-        from scipy.spatial import cKDTree
-
         means = gaussians.means.numpy()
         adds = self.owns(means)
         length, longest = (each.numpy() for each in gaussians.scales.max(dim=1))

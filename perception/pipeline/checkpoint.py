@@ -28,6 +28,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
+import torch
+
 from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.train import Trainer
@@ -167,8 +169,6 @@ class FeatureCheckpoints:
 
 def save_checkpoint(path: Path, state: dict[str, Any], mark: str) -> None:
     """Writes `state` with the fingerprint `mark` of its settings, atomically."""
-    import torch
-
     with atomic_file(path) as aside, aside.open("wb") as file:
         writer = _Writer(file)
         torch.save({"mark": mark, "state": state}, cast(BinaryIO, writer))
@@ -197,8 +197,6 @@ class _Writer:
 
 def load_checkpoint(path: Path, mark: str) -> dict[str, Any] | None:
     """The state saved at `path`; None when there is none. InputError when it is damaged or of other settings."""
-    import torch
-
     if not path.is_file():
         return None
     with refusing(f"{path}: the checkpoint is damaged; delete {path.parent} to start over"):

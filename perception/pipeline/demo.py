@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from perception.config import load_config
 from perception.evaluate.instances import evaluate
@@ -87,7 +88,6 @@ def run_demo(output: Path, progress: Progress, seed: int = 0) -> tuple[dict[str,
         "peak_memory_mib": gmap.info["peak_memory_mib"],
     }
     facts["report"] = str(write_map_report(gmap, output / "report.html", [query["text"] for query in queries]))
-    from PIL import Image
 
     Image.fromarray(map_picture(gmap, truth.prompts[0])).save(output / "demo.jpg", quality=88)
     (output / "demo.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")

@@ -16,6 +16,7 @@ from perception.frame.world_frame import in_world_frame, references
 from perception.gaussians.photos import held_out_names, split_scene
 from perception.inputs.load import load_scene
 from perception.language.base import Encoder
+from perception.language.encoders import make_encoder
 from perception.language.ocr import TextReader, make_reader
 from perception.machine import return_free_memory
 from perception.map.write import Map, write_map
@@ -101,8 +102,6 @@ def build_map(
 
 def _open_models(run: Run) -> tuple[MaskSource, Encoder | None, TextReader | None]:
     """The source of masks; the image-text encoder, None if disabled or if "auto" has none; the reader of texts."""
-    from perception.language.encoders import make_encoder
-
     config, encoder = run.config, None
     masks, spec = make_source(config.masks, config.sam), config.language.encoder
     try:
@@ -129,8 +128,7 @@ def _posed_scene(output: Path, run: Run, splat: SplatInput | None) -> Scene:
             masks, camera, cloud = (Path(file) if file else None for file in files)
             options = ReadOptions(work / "sfm", config.seed, progress, photos.strict, masks, camera)
             options = replace(options, frames=frames_folder(output), init_points=cloud, poses=photos.poses)
-            options = replace(options, still=photos.ignore_still)
-            scene = load_scene(source, replace(options, engine=run.engine))
+            scene = load_scene(source, replace(options, still=photos.ignore_still, engine=run.engine))
             save_scene(kept, scene := in_world_frame(recentred(scene), config.frame, config.seed))
         if config.losses.depth_weight == 0:
             scene = replace(scene, views=[replace(view, depth=None) for view in scene.views])
