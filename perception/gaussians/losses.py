@@ -19,8 +19,6 @@ from torch import Tensor
 from perception.gaussians.device import training_kernels
 from perception.io.memory import Keep
 
-# ---------- photometric
-
 
 @dataclass(frozen=True)
 class PhotometricLoss:
@@ -50,8 +48,6 @@ def photometric(render: Tensor, target: Tensor, beta: float, weight: Tensor | No
     return PhotometricLoss(value, gradient, l1, ssim)
 
 
-# ---------- depth
-
 _DEPTH_NOISE = 0.01
 """σ, the relative error of depth below which the loss is quadratic: the noise of a Kinect at 2 m is 0.7 cm."""
 
@@ -74,9 +70,6 @@ def depth_loss(depths: Tensor, alphas: Tensor, measured: Tensor) -> tuple[float,
     pull = error.div_(length).div_(target).mul_(share)
     value = length.sub_(_DEPTH_NOISE + 1).mul_(alphas).add_(1).mul_(share)
     return training_kernels(depths.device).sum(value.reshape(-1), False), pull, expected.mul_(pull).add_(share).neg_()
-
-
-# ---------- instance
 
 
 @dataclass(frozen=True)
@@ -149,9 +142,6 @@ def instance_loss(
     pull, push = 2 * w_pos * shares, w_neg * apart / counts[:, None]
     kernels.spread(flat, labels.slots, means, pull, push, gradient.view(flat.shape))
     return InstanceLoss(w_pos * pos + w_neg * neg, gradient, pos, neg, means)
-
-
-# ---------- variance
 
 
 def variance_loss(variance: Tensor, weight: float) -> tuple[float, Tensor]:

@@ -246,21 +246,17 @@ def _end_trial(state: TrainingState, reached: float) -> None:
 
 
 def _stop_early(state: TrainingState) -> None:
-    """Skips to the cool-down when more training gains too little."""
+    """Skips to the cool-down when more training gains too little; not before features were trained for FEATURES_NEED,
+    and not shortly before the cool-down."""
     stopping, progress = state.stopping, state.progress
-    if stopping.finished or not stopping.degree_decided or progress < STOP or not _may_stop(state, progress):
+    needed = max(STOP, state.config.losses.start + FEATURES_NEED if state.has_labels else 0.0)
+    if stopping.finished or not stopping.degree_decided or not needed <= progress < 1.0 - COOLDOWN - TRIAL:
         return
     if (reason := stopping.plateau(progress)) is not None:
         stopping.finished, stopping.growing = True, False
         left = 1.0 - COOLDOWN - progress
         state.skipped += left
         _note(state, f"{reason}; {left:.0%} of the training skipped")
-
-
-def _may_stop(state: TrainingState, progress: float) -> bool:
-    """Whether early stopping is allowed: features were trained for FEATURES_NEED, and the cool-down is not near."""
-    needed = state.config.losses.start + FEATURES_NEED if state.has_labels else 0.0
-    return needed <= progress < 1.0 - COOLDOWN - TRIAL
 
 
 def _note(state: TrainingState, decision: str | None) -> None:

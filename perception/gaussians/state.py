@@ -116,8 +116,6 @@ class TrainingState:
         self.show(views)
         self._since: float | None = None  # time.monotonic() at the start of `running`, None outside
 
-    # ---------------------------------------------------------------- progress
-
     @property
     def growing_by(self) -> str:
         """The gradient by which Gaussians are chosen for growth."""
@@ -146,8 +144,6 @@ class TrainingState:
             return max(self.iteration, round(self.iteration / max(progress, 1e-6)))
         return round(self.iteration + (1 - progress) * self.config.train.iterations)
 
-    # ------------------------------------------------------------------- views
-
     def show(self, views: list[TrainingView]) -> None:
         """Sets the training views: the same photos as before, possibly with labels added."""
         self.views, self.coarse = views, [view.halved().stored() for view in views]
@@ -170,8 +166,6 @@ class TrainingState:
         if view.labels is not None and view.name not in self._assigned:
             self._assigned[view.name] = assign_labels(view.labels, view.keep).to(self.device)
         return self._assigned.get(view.name)
-
-    # ------------------------------------------------------------------- model
 
     def keep(self, rows: torch.Tensor) -> None:
         """Keeps the Gaussians that `rows` [M] int64 selects, with their Adam moments."""
@@ -208,8 +202,6 @@ class TrainingState:
         zeros = {name: torch.zeros_like(self.optimiser.params[stored]) for name, stored in STORED.items()}
         zeros[self.growing_by] = self.gaussians.means.new_zeros(1, len(self.gaussians), 2)
         self.gradients = Gradients(**zeros)
-
-    # -------------------------------------------------------------- checkpoint
 
     def state(self, copy: bool = True) -> dict[str, Any]:
         """All values needed to resume, for a checkpoint; without `copy` they are those of now until the next step."""

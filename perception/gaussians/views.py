@@ -15,7 +15,6 @@ from perception.io.memory import Keep
 from perception.rasterizer.rasterize import rasterizer_for
 from perception.rasterizer.types import Forward, Settings
 
-_ON_DEVICE = ("photo", "K", "camera_from_world", "weight", "depth", "gain")
 BEST_PSNR = 100.0
 """PSNR in dB of two equal images, as in `evaluate.images`: finite, so that means and JSON stay valid."""
 
@@ -67,7 +66,8 @@ class TrainingView:
 
     def to(self, device: torch.device) -> TrainingView:
         """The view on `device`, but for the labels, which `losses.assign_labels` reads once."""
-        tensors: dict[str, Any] = {name: getattr(self, name) for name in _ON_DEVICE}
+        names = ("photo", "K", "camera_from_world", "weight", "depth", "gain")
+        tensors: dict[str, Any] = {name: getattr(self, name) for name in names}
         return replace(self, **{name: tensor.to(device) for name, tensor in tensors.items() if tensor is not None})
 
     def halved(self) -> TrainingView:

@@ -3,8 +3,7 @@
     s_vi = (mask pixels of i in v / pixels of v) · (Gaussians of i visible in v / Gaussians of i)
 
 The K views with the largest s_vi are kept. Each gives L square crops with growing margins (K = 5, L = 3 in the paper).
-Three variants gained nothing beyond the noise over 211 prompts of two scenes: views chosen for different directions,
-dimmed backgrounds, and blurred backgrounds.
+Views of different directions, and dimmed or blurred backgrounds, gained nothing over 211 prompts.
 """
 
 from __future__ import annotations

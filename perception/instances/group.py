@@ -77,12 +77,11 @@ def group(
     equal labels of two photos are of one thing, so there is nothing to find out from features and agreement.
     """
     features = np.where(np.isfinite(features), features, 0) / np.sqrt(margin)
+    parts, parents = np.full(len(means), -1), np.zeros(0, np.int64)
     if config.method == "hdbscan":
         ids = cluster_gaussians(means, scales, opacities, features, config, seed)
-        parts, parents = np.full(len(ids), -1), np.zeros(0, np.int64)
     elif one_surface:
         ids = _by_labels(means, opacities, votes)
-        parts, parents = np.full(len(ids), -1), np.zeros(0, np.int64)
     else:
         ids, parts, parents = _by_consensus(means, opacities, features, votes, seed)
     if config.settle:
@@ -131,9 +130,8 @@ def _by_consensus(
     below = parts_of(tree, cut, seen)
     for number, (_, node) in enumerate(below):
         part[tree.leaves_of(node)] = number
-    parents = [number for number, _ in below]
     ids[solid], parts[solid] = instance[segments], part[segments]
-    return ids, parts, np.array(parents, np.int64)
+    return ids, parts, np.array([number for number, _ in below], np.int64)
 
 
 def _parted_by_masks(

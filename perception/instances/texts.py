@@ -74,7 +74,7 @@ def owner_of(corners: np.ndarray, ids: np.ndarray) -> int | None:
     points = np.floor(top[:, None] + t[None] * (bottom - top)[:, None]).astype(np.int64).reshape(-1, 2)
     inside = ((points >= 0) & (points < ids.shape[::-1])).all(axis=1)
     shown = ids[points[inside, 1], points[inside, 0]]
-    counts = np.bincount(shown[shown >= 0]) if (shown >= 0).any() else np.zeros(1, int)
+    counts = np.bincount(shown[shown >= 0], minlength=1)
     return int(counts.argmax()) if counts.max() >= COVER * len(points) else None
 
 

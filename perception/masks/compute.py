@@ -42,7 +42,7 @@ def compute_masks(
     Report: source, identity, photos, skipped, seconds, masks (mean per photo), empty (names), warnings.
     """
     warnings = source.check(views)
-    start, skipped, counts = perf_counter(), 0, list[int]()
+    start, counts, known = perf_counter(), list[int](), list[bool]()
     if source.needs_depth:
         if load_depth is None:
             raise ValueError(f"masks from {source.name} need load_depth")
@@ -56,19 +56,18 @@ def compute_masks(
     def masks_of(view: View) -> tuple[int, bool]:
         """Number of masks in the view's label image, and whether it was there already."""
         key, file = _key(view, source, depth_key), label_file(folder, view)
-        known = stored_key(file) == key
-        if known:
+        if there := stored_key(file) == key:
             labels = load_labels(folder, view)
         else:
             labels = source.label_image(view, load_photo(view))
             write_labels(file, labels, key)
-        return len(np.setdiff1d(labels, [0])), known
+        return len(np.setdiff1d(labels, [0])), there
 
     with ThreadPoolExecutor(source.photos_at_once) as pool:
-        for done, (count, known) in enumerate(pool.map(masks_of, views), start=1):
+        for count, there in pool.map(masks_of, views):
             counts.append(count)
-            skipped += known
-            progress.update(f"masks ({source.name})", done, len(views))
+            known.append(there)
+            progress.update(f"masks ({source.name})", len(counts), len(views))
     empty = [view.name for view, count in zip(views, counts, strict=True) if not count]
     if empty:
         warnings = [*warnings, f"masks from {source.name}: nothing was found in {len(empty)} photos ({empty[0]}, …)"]
@@ -76,7 +75,7 @@ def compute_masks(
         "source": source.name,
         "identity": source.identity,
         "photos": len(views),
-        "skipped": skipped,
+        "skipped": sum(known),
         "seconds": perf_counter() - start,
         "masks": float(np.mean(counts)) if counts else 0.0,
         "empty": empty,

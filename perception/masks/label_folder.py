@@ -26,10 +26,11 @@ class LabelFolder(MaskSource):
     def __init__(self, folder: Path) -> None:
         if not folder.is_dir():
             raise InputError(f"labels:{folder}: no such folder; expected one PNG per photo in it")
-        if not _pngs(folder):
+        self._pngs = sorted(file for file in folder.rglob("*") if file.suffix.lower() == ".png")
+        if not self._pngs:
             raise InputError(f"labels:{folder}: holds no PNG; expected a label image for each photo")
         digest = hashlib.sha256()
-        for file in _pngs(folder):
+        for file in self._pngs:
             status = file.stat()
             digest.update(f"{file.relative_to(folder)} {status.st_size} {status.st_mtime_ns}\n".encode())
         self.name, self.folder, self.identity = "labels", folder, f"labels {digest.hexdigest()[:16]}"
@@ -50,7 +51,7 @@ class LabelFolder(MaskSource):
         # No warning for photos that were kept out of training or not registered.
         folders = {view.photo.parent for view in views if view.photo.parent.is_dir()} - {self.folder}
         photos = {file.stem for folder in folders for file in folder.iterdir()}
-        left = [file for file in _pngs(self.folder) if file not in used]
+        left = (file for file in self._pngs if file not in used)
         extra = [str(file.relative_to(self.folder)) for file in left if file.stem not in photos]
         if extra:
             return [f"labels:{self.folder}: {_some(extra)} belong to no photo of the map and are ignored"]
@@ -83,10 +84,6 @@ def _check_header(file: Path, width: int, height: int) -> None:
     if size != [width, height]:
         both = f"{size[0]}×{size[1]} pixels, but its photo has {width}×{height}"
         raise InputError(f"{file}: {both}; label images have the size of the original photo")
-
-
-def _pngs(folder: Path) -> list[Path]:
-    return sorted(file for file in folder.rglob("*") if file.suffix.lower() == ".png")
 
 
 def _some(names: list[str]) -> str:

@@ -10,7 +10,6 @@ a point in the same smallest part asks for the same masks again.
 
 from __future__ import annotations
 
-import math
 import zlib
 from dataclasses import dataclass
 from itertools import chain
@@ -113,7 +112,7 @@ def paint(masks: list[SamMask], shape: tuple[int, int]) -> np.ndarray:
 def stability(logits: np.ndarray) -> np.float32:
     """IoU of the masks of `logits` [h, w] thresholded at ± STABILITY_OFFSET, in float32; NaN where both are empty."""
     inner, outer = (np.count_nonzero(logits > offset) for offset in (STABILITY_OFFSET, -STABILITY_OFFSET))
-    return np.float32(inner) / np.float32(outer) if outer else np.float32(math.nan)
+    return np.float32(inner) / np.float32(outer) if outer else np.float32("nan")
 
 
 def mask_box(mask: np.ndarray) -> np.ndarray:

@@ -97,9 +97,6 @@ def build_map(
     return gmap
 
 
-# ----------------------------------------------------------------------- stages
-
-
 def _open_models(run: Run) -> tuple[MaskSource, Encoder | None, TextReader | None]:
     """The source of masks; the image-text encoder, None if disabled or if "auto" has none; the reader of texts."""
     config, encoder = run.config, None
@@ -159,9 +156,6 @@ def _assemble(
         parts=described.parts,
         groups=described.groups,
     )
-
-
-# ----------------------------------------------------------------------- log
 
 
 def _log_scene(scene: Scene, progress: Progress) -> None:
