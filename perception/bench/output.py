@@ -14,8 +14,7 @@ from typing import Any
 
 from perception.io.atomic import write_file
 
-Column = tuple[str, str, str]
-"""(column header, key in the row, format specification)."""
+Column = tuple[str, str, str]  # (column header, key in the row, format specification)
 
 
 def bench_parser(name: str, about: str | None) -> argparse.ArgumentParser:

@@ -22,35 +22,22 @@ from perception.gaussians.device import training_kernels
 from perception.gaussians.model import Gaussians, isotropic, sigmoid
 from perception.gaussians.views import TrainingView, render, unprojected
 
-START, STOP = 0.05, 0.6
-"""Progress at which the number of Gaussians begins and ends to grow."""
-PERCENT_DENSE = 0.01
-"""A Gaussian is split if its largest scale exceeds this share of the scene extent, else cloned (Kerbl et al. 2023)."""
-PRUNE_OPACITY = 0.005
-"""Opacity below which a Gaussian is removed (Kerbl et al. 2023)."""
-OPACITY_MARGIN = 1e-6
-"""Opacities are kept this far from 0 and 1, where logits are infinite."""
-OPACITY_DECAY = 1e-2
-"""Share by which every opacity is reduced before each densification."""
-SPLIT_SHRINK = 1.6
-"""Scales of the two halves of a split Gaussian are divided by this (Kerbl et al. 2023)."""
-BEYOND = 0.3
-"""Factor on the gradient of a Gaussian beyond the box for which a block of a large scene is trained: it will be dropped
-later, and is needed only for what photos show behind or beside the box."""
+START, STOP = 0.05, 0.6  # progress at which the number of Gaussians begins and ends to grow
+PERCENT_DENSE = 0.01  # of the scene extent: a Gaussian of a larger scale is split, else cloned (Kerbl et al. 2023)
+PRUNE_OPACITY = 0.005  # opacity below which a Gaussian is removed (Kerbl et al. 2023)
+OPACITY_MARGIN = 1e-6  # opacities are kept this far from 0 and 1, where logits are infinite
+OPACITY_DECAY = 1e-2  # share by which every opacity is reduced before each densification
+SPLIT_SHRINK = 1.6  # scales of the two halves of a split Gaussian are divided by this (Kerbl et al. 2023)
+BEYOND = 0.3  # factor on gradients outside a block's box: what grows there is dropped later, but photos show it
 
-BLOCK = 8
-"""Side of a block in pixels."""
-EMPTY = 0.5
-"""A block is empty when its mean opacity is below this."""
-NEAREST = 1 / 3
-"""Share of the covered blocks, the nearest in the picture, from which the depth of an empty one is taken."""
+BLOCK = 8  # side of a block in pixels
+EMPTY = 0.5  # a block is empty when its mean opacity is below this
+NEAREST = 1 / 3  # share of the covered blocks, the nearest in the picture, that give an empty one its depth
 FAR = 0.95
 """Quantile of their depths that is used: regions without points are mostly background, and what fills them too near
 hangs as a veil before other cameras. With 12 blocks and 0.75 a wall behind a tree was put at the tree's depth."""
-MOST_BLOCKS = 2000
-"""Covered blocks that are looked at, evenly over the picture: as many pairs with empty ones are held in memory."""
-HOLE_OPACITY = 0.5
-"""Opacity of the Gaussians added."""
+MOST_BLOCKS = 2000  # covered blocks that are looked at, evenly: as many pairs with empty ones are held in memory
+HOLE_OPACITY = 0.5  # opacity of the Gaussians added
 
 
 @dataclass

@@ -21,24 +21,17 @@ from perception.geometry import sums_by
 from perception.machine import in_threads
 from perception.masks.surface import voxel_keys
 
-SAMPLES = 1_500_000
-"""Most pixels that are fused; an even grid of pixels is taken from more."""
-FINEST = 2.0
-"""Least voxel side in pixel footprints at the median depth."""
-LEAST_PIXELS = 2
-"""Samples that a voxel needs: fewer are mostly noise."""
-REACH = 4
-"""Pixels to either side between which the slope of the surface is measured."""
-AGREE = 0.04
-"""Relative difference of depths up to which a view sees a voxel. If its depth is larger, it looks through the voxel."""
-STEEPEST = 0.2
-"""Least cosine between a pixel's ray and the surface normal: steeper surfaces are measured badly."""
+SAMPLES = 1_500_000  # most pixels that are fused; an even grid of pixels is taken from more
+FINEST = 2.0  # least voxel side in pixel footprints at the median depth
+LEAST_PIXELS = 2  # samples that a voxel needs: fewer are mostly noise
+REACH = 4  # pixels to either side between which the slope of the surface is measured
+AGREE = 0.04  # relative difference of depths up to which a view sees a voxel; beyond, it looks through it
+STEEPEST = 0.2  # least cosine between a pixel's ray and the surface normal: steeper surfaces are measured badly
 OPACITY, WIDTH, THICKNESS, NEIGHBOURS = 0.9, 0.7, 0.1, 9
 """The first Gaussians are nearly opaque discs: WIDTH of the voxels' spacing, THICKNESS of that along the normal of
 their nearest NEIGHBOURS. Balls hide what lies behind slanted surfaces: their depth is 5 cm too short in the median, and
 that of discs 3 cm (kitchen_rgbd, voxels of 6 cm, before training)."""
-SHARE = 0.5
-"""Share of the budget for the surface; the rest grows where the photos need it."""
+SHARE = 0.5  # share of the budget for the surface; the rest grows where the photos need it
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,7 @@ import torch
 from perception import _core
 from perception.errors import InputError
 
-_LEAST_MEMORY = 2 << 30
-"""Free bytes that a GPU must have: a default map takes about half of it."""
+_LEAST_MEMORY = 2 << 30  # free bytes that a GPU must have: a default map takes about half of it
 
 
 def training_kernels(device: torch.device) -> Any:

@@ -10,14 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-TRIAL = 0.05
-"""Length of a trial, as a share of training progress."""
-CEILING = 45.0
-"""PSNR in dB above which gains are not counted: an RMS error of 1.4 of 255 grey levels, below a photo's noise."""
-COST_EXPONENT = 0.6
-"""The time of an iteration grows with the number of Gaussians to this power (tools/speed/fronts.py)."""
-HARMONICS_GAIN = 0.05
-"""Least gain in held-out PSNR, in dB, for which the highest degree of harmonics is kept."""
+TRIAL = 0.05  # length of a trial, as a share of training progress
+CEILING = 45.0  # dB of PSNR up to which gains count: an RMS error of 1.4 of 255, below a photo's noise
+COST_EXPONENT = 0.6  # the time of an iteration grows with the number of Gaussians to this power (tools/speed/fronts.py)
+HARMONICS_GAIN = 0.05  # least gain in held-out PSNR, in dB, for which the highest degree of harmonics is kept
 
 
 @dataclass

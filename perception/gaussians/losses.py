@@ -48,8 +48,7 @@ def photometric(render: Tensor, target: Tensor, beta: float, weight: Tensor | No
     return PhotometricLoss(value, gradient, l1, ssim)
 
 
-_DEPTH_NOISE = 0.01
-"""σ, the relative error of depth below which the loss is quadratic: the noise of a Kinect at 2 m is 0.7 cm."""
+_DEPTH_NOISE = 0.01  # σ, the relative error up to which the loss is quadratic: a Kinect's noise at 2 m is 0.7 cm
 
 
 def depth_loss(depths: Tensor, alphas: Tensor, measured: Tensor) -> tuple[float, Tensor, Tensor]:

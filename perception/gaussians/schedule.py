@@ -32,26 +32,18 @@ COARSE_UNTIL, COARSE_UNTIL_SMALL, LARGE = 0.4, 0.15, 400
 """Progress until which photos of half the resolution are used: steps are cheaper, and large structures are fitted.
 The first for photos with a long side of LARGE pixels or more: there, until .15 instead takes 28 % more (Gaussian,
 pixel) pairs for .1 to .4 dB less. Half of a smaller photo shows too little to start the built-in masks from."""
-JUDGED_FROM = 0.25
-"""Progress from which growth may end."""
-FILL_EVERY = 5
-"""Every FILL_EVERY-th densification also adds Gaussians in image regions that the map leaves empty."""
-FEATURES_NEED = 0.35
-"""Share of training progress for which features are trained before early stopping is allowed."""
-COOLDOWN = 0.1
-"""Final share of training progress, over which all rates decrease to a twentieth."""
-SCORED, NOTED = 8, 6
-"""Maximum number of held-out views scored at the end of a trial, and for one point of the quality curve."""
+JUDGED_FROM = 0.25  # progress from which growth may end
+FILL_EVERY = 5  # every FILL_EVERY-th densification also adds Gaussians in image regions that the map leaves empty
+FEATURES_NEED = 0.35  # share of training progress for which features are trained before early stopping is allowed
+COOLDOWN = 0.1  # final share of training progress, over which all rates decrease to a twentieth
+SCORED, NOTED = 8, 6  # most views that are scored at the end of a trial, and for a point of the quality curve
 
 MEANS, MEANS_LAST = 8e-4, 2e-5
 """Rates of the means at the start and at the end, times the scene extent, for ITERATIONS. Kerbl et al. 2023 have 1.6e-4
 and 1.6e-6 for 30,000 iterations."""
-QUATS = 4e-3
-"""For ITERATIONS; for 30,000 it is that of Kerbl et al., 1e-3."""
-LARGEST_FACTOR = 2.0
-"""Largest factor of these rates in shorter runs."""
-SCALES = 1e-2
-"""Rate of the log-scales: twice that of Kerbl et al. COLORS is also twice theirs, HARMONICS eight times theirs."""
+QUATS = 4e-3  # for ITERATIONS; for 30,000 it is that of Kerbl et al., 1e-3
+LARGEST_FACTOR = 2.0  # largest factor of these rates in shorter runs
+SCALES = 1e-2  # of log-scales; twice that of Kerbl et al., as COLORS is; HARMONICS is eight times theirs
 OPACITIES = 0.05
 COLORS, HARMONICS = 5e-3, 1e-3
 FEATURES = 2e-2

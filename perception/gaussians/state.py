@@ -24,8 +24,7 @@ from perception.geometry import along_curve
 from perception.progress import timed
 from perception.rasterizer.types import Gradients
 
-USUAL_PHOTOS = 43
-"""Training photos of a table or a small room, for which ITERATIONS and BUDGET were chosen; fewer need as many."""
+USUAL_PHOTOS = 43  # of a table or a small room, for which ITERATIONS and BUDGET were chosen; fewer need as many
 ITERATIONS, BUDGET = 2000, 100_000
 
 

@@ -21,14 +21,10 @@ from perception.photos.depth import without_edges
 from perception.progress import QUIET, Progress
 from perception.types import View
 
-GRID, HIDDEN = 16, 1.3
-"""A point is hidden from a photo if it is HIDDEN times as far as the nearest point in its cell of GRID × GRID."""
-FEW = 16
-"""Photos of the median sparse point up to which stereo is used: more fix the depth by their colours."""
-LEAST_POINTS = 100
-"""Sparse points of a scene below which the range of depths is not known."""
-CELLS = 64
-"""Cells along a side of the photo in which the nearest visible point is what is known before."""
+GRID, HIDDEN = 16, 1.3  # a point is hidden if HIDDEN times as far as the nearest in its cell of GRID × GRID
+FEW = 16  # photos of the median sparse point up to which stereo is used: more fix the depth by their colours
+LEAST_POINTS = 100  # sparse points of a scene below which the range of depths is not known
+CELLS = 64  # cells along a side of the photo in which the nearest visible point is what is known before
 
 PATCH, FLAT = 7, 0.5
 """Side of a patch in pixels; standard deviation of grey levels below which it shows nothing but rounding,

@@ -29,12 +29,9 @@ from perception.machine import torch_on_one_thread
 from perception.rasterizer.rasterize import rasterizer_for
 from perception.rasterizer.types import Cotangents, Forward, Gradients, Settings
 
-SSIM_WEIGHT = 0.2
-"""β of the photometric loss (eq. 4), as in Kerbl et al. 2023."""
-_LEAST_RECORDS = 1 << 18
-"""Gradient records that a GPU must have room for at once (see `Settings.max_records`)."""
-INSTANCE_WEIGHT = 0.1
-"""λ_inst2d of eq. 14; w_p = w_n = 1 in eq. 9."""
+SSIM_WEIGHT = 0.2  # β of the photometric loss (eq. 4), as in Kerbl et al. 2023
+_LEAST_RECORDS = 1 << 18  # gradient records that a GPU must have room for at once (see `Settings.max_records`)
+INSTANCE_WEIGHT = 0.1  # λ_inst2d of eq. 14; w_p = w_n = 1 in eq. 9
 
 
 class Observer(Protocol):

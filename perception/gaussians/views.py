@@ -15,8 +15,7 @@ from perception.io.memory import Keep
 from perception.rasterizer.rasterize import rasterizer_for
 from perception.rasterizer.types import Forward, Settings
 
-BEST_PSNR = 100.0
-"""PSNR in dB of two equal images, as in `evaluate.images`: finite, so that means and JSON stay valid."""
+BEST_PSNR = 100.0  # PSNR in dB of two equal images, as in `evaluate.images`: finite, so that means and JSON stay valid
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,8 @@ from perception.config import InstanceConfig
 from perception.geometry import nearest
 
 NEIGHBOURS = 12
-MIN_OPACITY = 0.1
-"""Minimum opacity of Gaussians that are clustered. Fainter ones are mostly semi-transparent noise between objects."""
-MAX_CLUSTERED = 60_000
-"""Maximum number of rows for exact HDBSCAN, whose time and memory grow faster than linearly."""
+MIN_OPACITY = 0.1  # of Gaussians that are clustered; fainter ones are mostly noise between objects
+MAX_CLUSTERED = 60_000  # maximum number of rows for exact HDBSCAN, whose time and memory grow faster than linearly
 
 
 def cluster_gaussians(

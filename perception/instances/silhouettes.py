@@ -14,10 +14,8 @@ from perception.gaussians.views import TrainingView, half_camera
 from perception.rasterizer.rasterize import rasterizer_for
 from perception.rasterizer.types import Settings
 
-MOST_LABELS = 1 << 24
-"""The rasterizer takes smaller ids only; larger ones are numbered anew."""
-HALVED_FROM = 480
-"""Long side in pixels from which silhouettes are rendered at half the resolution, at a third of the time."""
+MOST_LABELS = 1 << 24  # the rasterizer takes smaller ids only; larger ones are numbered anew
+HALVED_FROM = 480  # pixels of the long side from which half the resolution is rendered, in a third of the time
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from perception.io.documents import safe_name
 from perception.photos.decode import decode, open_photo
 from perception.types import View
 
-LARGEST = 65535
-"""The largest label that 16 bits hold. With larger ones, equal labels of two photos are of different things."""
+LARGEST = 65535  # of 16 bits; where labels are larger, equal ones of two photos are of different things
 _KEY = "perception-masks"
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 

@@ -85,8 +85,7 @@ def read_model(file: Path = WEIGHTS) -> MergeModel:
     return MergeModel(Network(tuple(arrays[:_ARRAYS])), Network(tuple(arrays[_ARRAYS:])), cost, (slope, offset))
 
 
-Regions = tuple[np.ndarray, np.ndarray]
-"""The region [V] of each voxel, and the probability of each region."""
+Regions = tuple[np.ndarray, np.ndarray]  # the region [V] of each voxel, and the probability of each region
 
 
 @dataclass(frozen=True)

@@ -35,14 +35,10 @@ from perception.progress import QUIET, Progress
 from perception.tasks.folder import has_task, read_facts, read_task, renew_task
 from perception.types import Scene, View
 
-SAMPLE = 20_000
-"""Sparse points by which the scene is cut."""
-SEEN = 0.15
-"""Least share of a photo's points in a block's box for which the block is trained on a photo from outside."""
-LEAST_GAIN = 0.85
-"""Largest share of a block's photos that either half may have after a cut; a scene that all photos see is not cut."""
-APART = 4.0
-"""Distance between the features of two blocks, which are not comparable: more than the loss's margin of 1."""
+SAMPLE = 20_000  # sparse points by which the scene is cut
+SEEN = 0.15  # least share of a photo's points in a block's box for which the block is trained on a photo from outside
+LEAST_GAIN = 0.85  # largest share of a block's photos in either half: a scene that all photos see is not cut
+APART = 4.0  # distance between the features of two blocks, which are not comparable: more than the loss's margin of 1
 ONES = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype=np.uint8)
 """Number of bits of a byte that are 1."""
 RESULT = "result.pt"

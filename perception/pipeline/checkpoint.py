@@ -44,11 +44,9 @@ from perception.splats.read import is_splat
 
 CHECKPOINT = "checkpoint.pt"
 BEFORE_MASKS = "before_masks.pt"
-CHECKPOINT_SECONDS = 20.0
-"""Interval between two checkpoints; an interruption loses at most this much work."""
+CHECKPOINT_SECONDS = 20.0  # interval between two checkpoints; an interruption loses at most this much work
 DRAWN_SECONDS = 0.5
-LATER = ("masks", "instances", "language")
-"""Groups of settings that the optimisation does not depend on, apart from the mask images."""
+LATER = ("masks", "instances", "language")  # settings that the optimisation does not depend on, but for masks
 
 
 def fingerprint(source: Path, config: MapConfig) -> str:
@@ -208,8 +206,7 @@ def load_checkpoint(path: Path, mark: str) -> dict[str, Any] | None:
     return state
 
 
-INPUTS = "inputs.json"
-"""Name of the list of input files in a work folder; every run writes it first."""
+INPUTS = "inputs.json"  # name of the list of input files in a work folder; every run writes it first
 TASKS = ("block-*", "labels-*", "model-*", "levels-*", "votes-*", "silhouettes-*", "leg-*")
 OWN = ("*.pt", "masks", "sfm", "poses-*", *TASKS, ".*.new-*", ".*.old-*", ".*.lock", INPUTS)
 """Names of all that a run writes in its work folder."""

@@ -24,10 +24,8 @@ from perception.query import QueryMap, load_map
 from perception.report.page import map_picture, write_map_report
 from perception.types import PointCloud
 
-SCENE = Path(__file__).parents[1] / "demo_scene"
-"""40 rendered photos of a table, and their truth (tools/worlds/make.py)."""
-SETTINGS = ["train.iterations=1300", "train.budget=40000"]
-"""Settings of the demo, for a small scene in under a minute on two cores."""
+SCENE = Path(__file__).parents[1] / "demo_scene"  # 40 rendered photos of a table and their truth (tools/worlds/make.py)
+SETTINGS = ["train.iterations=1300", "train.budget=40000"]  # for a small scene in under a minute on two cores
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,7 @@ from perception.progress import QUIET, Progress
 from perception.report.page import write_own_report
 from perception.tasks.engine import Engine
 
-_WORDS = {"None": "none", "True": "on", "False": "off"}
-"""Values of YAML in the words of settings."""
+_WORDS = {"None": "none", "True": "on", "False": "off"}  # values of YAML in the words of settings
 
 
 class Job(Settings):

@@ -32,8 +32,7 @@ from perception.masks.merging import Segmentation
 from perception.pipeline.optimise import Optimised, Run
 from perception.pipeline.photo_tasks import by_tasks, silhouettes_by_tasks, votes_by_tasks
 
-NODE_VIEWS = 3
-"""Views of each part and group that are embedded. By one crop of each, some of the many look like what is not there."""
+NODE_VIEWS = 3  # views of each part and group; by one crop each, some of the many look like what is not there
 
 
 @dataclass

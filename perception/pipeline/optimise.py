@@ -33,10 +33,8 @@ from perception.tasks.engine import LOCAL, Engine
 from perception.tasks.folder import read_task, renew_task
 from perception.types import Scene, View
 
-GEOMETRY_START = 0.3
-"""Training progress at which masks that use the depth of the map (the built-in ones) are made."""
-PHOTOS_A_TASK = 8
-"""Photos whose masks one task makes: minutes with SAM on a CPU, and reading the model takes seconds."""
+GEOMETRY_START = 0.3  # training progress at which masks that use the depth of the map (the built-in ones) are made
+PHOTOS_A_TASK = 8  # photos whose masks one task makes: minutes with SAM on a CPU, and reading the model takes seconds
 
 
 @dataclass

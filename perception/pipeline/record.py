@@ -18,10 +18,8 @@ from perception.pipeline.optimise import Optimised, Run
 from perception.tasks.folder import versions
 from perception.types import Scene
 
-CLOSE_METRES, CLOSE_SHARE = 0.05, 0.025
-"""Errors that count as close: in metres, or relative to the depth where the unit is not known to be the metre."""
-FRAME_FACTS = ("map_from_input", "scale", "gravity")
-"""Entries of a scene's report that map.json holds at its top level."""
+CLOSE_METRES, CLOSE_SHARE = 0.05, 0.025  # errors that count as close: in metres, or relative where the unit is unknown
+FRAME_FACTS = ("map_from_input", "scale", "gravity")  # entries of a scene's report that map.json holds at its top level
 
 
 def finite(value: Any) -> Any:

@@ -15,8 +15,7 @@ from perception.errors import InputError
 from perception.machine import threads_before
 from perception.rasterizer.types import Cotangents, Forward, Gradients, Inputs, Settings
 
-simd_levels = _core.simd_levels
-"""The SIMD levels this processor supports, best first."""
+simd_levels = _core.simd_levels  # the SIMD levels this processor supports, best first
 
 
 def _compiled(name: str, tensor: Tensor) -> Any:

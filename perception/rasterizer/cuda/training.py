@@ -34,8 +34,7 @@ MASKS = device.structure(
     "Masks", "features slots counts first parts means scatter pull push spread", "pixels masks dims"
 )
 PAIRS = device.structure("Pairs", "points gradient value", "count dims", "margin", ctypes.c_double)
-_PIECES = 32
-"""As kPieces of instances.h."""
+_PIECES = 32  # as kPieces of instances.h
 
 
 def _kernels(of: Tensor) -> Kernels:
