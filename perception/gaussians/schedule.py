@@ -29,9 +29,8 @@ from perception.gaussians.views import TrainingView, psnr, render_view, visible_
 from perception.machine import return_free_memory
 
 COARSE_UNTIL, COARSE_UNTIL_SMALL, LARGE = 0.4, 0.15, 400
-"""Progress until which photos of half the resolution are used: steps are cheaper, and large structures are fitted.
-The first for photos with a long side of LARGE pixels or more: there, until .15 instead takes 28 % more (Gaussian,
-pixel) pairs for .1 to .4 dB less. Half of a smaller photo shows too little to start the built-in masks from."""
+"""Progress until which photos of half the resolution are used, the first from a long side of LARGE pixels on: until .15
+there takes 28 % more pairs for .1 to .4 dB less. Half of a smaller photo shows too little for the built-in masks."""
 JUDGED_FROM = 0.25  # progress from which growth may end
 FILL_EVERY = 5  # every FILL_EVERY-th densification also adds Gaussians in image regions that the map leaves empty
 FEATURES_NEED = 0.35  # share of training progress for which features are trained before early stopping is allowed
@@ -120,8 +119,7 @@ def finish(state: TrainingState) -> None:
 
 def _densify_and_judge(state: TrainingState, progress: float) -> None:
     trial_ends = state.progress >= state.stopping.due and not state.stopping.finished
-    # PSNR is measured before densification, which lowers it for a while. Measured after it, most trials of a short
-    # run showed no gain, and growth ended 0.6 dB too early (tabletop_a).
+    # Before densification, which lowers PSNR for a while: after it, most trials of a short run showed no gain.
     reached = score(state, SCORED)["psnr"] if trial_ends else None
     if START <= progress < STOP:
         _densify(state, progress)

@@ -16,9 +16,8 @@ CALIBRATION = (
     (0.0, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0),
     (0.0, 0.011, 0.545, 0.553, 0.572, 0.828, 0.921, 0.983, 1.0),
 )
-"""Raw scores, and the probability of IoU > 0.5 with a true object at each: fitted to 983 instances (878 correct) of 15
-made places with perfect masks and with a segmenter's errors (`python tools score.places --fit`), before `levels` took
-out the faint ones."""
+"""Raw scores, and the probability of IoU > 0.5 with a true object at each: fitted to 983 instances of 15 made places
+with perfect masks and with a segmenter's errors, faint ones among them (`python tools score.places --fit`)."""
 
 
 def raw_scores(ids: np.ndarray, membership: np.ndarray, seen: Evidence) -> np.ndarray:

@@ -19,7 +19,7 @@ from perception.gaussians.views import TrainingView
 from perception.io.memory import Keep
 from perception.machine import return_free_memory, torch_on_one_thread
 from perception.masks.votes import MaskVotes
-from perception.progress import Progress
+from perception.progress import QUIET, Progress
 from perception.rasterizer.rasterize import rasterizer_for
 from perception.rasterizer.types import Cotangents, Gradients, Settings
 
@@ -43,7 +43,7 @@ def mask_votes(
     views: Sequence[TrainingView],
     *,
     half_resolution: bool = True,
-    progress: Progress | None = None,
+    progress: Progress = QUIET,
     keep: Keep = np.asarray,
 ) -> MaskVotes:
     """The votes of all masks of all views, by `view_votes`. keep: where the weights are kept, which grow with photos ×
@@ -53,31 +53,26 @@ def mask_votes(
 
 
 def joined_votes(
-    found: Iterable[ViewVotes | None], count: int, views: int, progress: Progress | None = None, keep: Keep = np.asarray
+    found: Iterable[ViewVotes | None], count: int, views: int, progress: Progress = QUIET, keep: Keep = np.asarray
 ) -> MaskVotes:
     """The votes of all masks from those of each of that many views, None for one without masks; count: of Gaussians."""
     parts: list[sparse.csc_matrix] = []  # by column: a row pointer per view would be as large as the model
     voids: list[sparse.csc_matrix] = []
-    owner: list[np.ndarray] = []
-    areas: list[np.ndarray] = []
-    labels: list[np.ndarray] = []
+    columns: list[tuple[np.ndarray, ...]] = []  # view, area and label of each mask
     for index, one in enumerate(found):
         if one is not None:
             parts.append(_kept(one.weights[:, 1:], keep))
             voids.append(_kept(one.weights[:, :1], keep))
-            areas.append(one.areas[1:])
-            labels.append(one.labels[1:].astype(np.int64))
-            owner.append(np.full(len(areas[-1]), len(owner), np.int64))
+            areas, labels = one.areas[1:], one.labels[1:].astype(np.int64)
+            columns.append((np.full(len(areas), len(columns), np.int64), areas, labels))
         del one
         if index % TRIM == TRIM - 1:
             return_free_memory()
-        if progress is not None:
-            progress.update("mask votes", index + 1, views)
+        progress.update("mask votes", index + 1, views)
     if not parts:
         none = sparse.csr_matrix((count, 0), dtype=np.float32)
         return MaskVotes(none, none, np.zeros(0, np.int64), np.zeros(0))
-    columns = (np.concatenate(each) for each in (owner, areas, labels))
-    return MaskVotes(beside(parts, keep), beside(voids, keep), *columns)
+    return MaskVotes(beside(parts, keep), beside(voids, keep), *map(np.concatenate, zip(*columns, strict=True)))
 
 
 def _kept(part: sparse.csc_matrix, keep: Keep) -> sparse.csc_matrix:

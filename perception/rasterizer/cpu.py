@@ -40,8 +40,7 @@ def rasterize_forward(inputs: Inputs, settings: Settings) -> Forward:
     """One forward pass. InputError names a value that is not finite."""
     out = Forward.empty(inputs, settings)
     images = _compiled("RasterizerImages", out.colors)(**_arrays(out, Forward.IMAGES))
-    more = _arrays(out, ("visible", "radii"))
-    run = _compiled("rasterize_forward", out.colors)
+    run, more = _compiled("rasterize_forward", out.colors), _arrays(out, ("visible", "radii"))
     try:
         out.frames = run(_inputs(inputs, settings), images, **more, simd=settings.simd)
     except ValueError as error:

@@ -174,17 +174,17 @@ def _check(
     tensors: dict[str, Tensor | None], width: int, height: int, sh_degree: int | None, near_plane: float, eps2d: float
 ) -> None:
     """Raises InputError for the first invalid argument."""
-    means = tensors["means"]
+    means: Any = tensors["means"]  # the first to be checked
     for name, t in tensors.items():
         if t is None and name in ("features", "background"):
             continue
         if not isinstance(t, torch.Tensor):
             raise InputError(f"rasterize: {name} is {type(t).__name__}, expected a torch.Tensor")
-        if t.device.type not in _DEVICES or (means is not None and t.device != means.device):
-            expected = "cpu or cuda" if means is None or t is means else f"{means.device}, where means are"
+        if t.device.type not in _DEVICES or t.device != means.device:
+            expected = "cpu or cuda" if t is means else f"{means.device}, where means are"
             raise InputError(f"rasterize: {name} is on {t.device}, expected {expected}")
-        if t.dtype not in (torch.float32, torch.float64) or (means is not None and t.dtype != means.dtype):
-            wanted = "float32 or float64" if means is None or t is means else means.dtype
+        if t.dtype not in (torch.float32, torch.float64) or t.dtype != means.dtype:
+            wanted = "float32 or float64" if t is means else means.dtype
             raise InputError(f"rasterize: {name} is {t.dtype}, expected {wanted}")
     _check_shapes(tensors, sh_degree)
     if not (1 <= width <= 1 << 20 and 1 <= height <= 1 << 20):
