@@ -199,7 +199,7 @@ def _row(name: str, scene: dict[str, Any], case: Case, turns: list[Turn]) -> dic
         "forward_ms": 1e3 * statistics.median(t.forward for t in turns), "cpu_ms": 1e3 * statistics.median(cpu),
         "ns_per_pair": 1e9 * statistics.median(cpu) / pairs, "least_ns_per_pair": 1e9 * min(cpu) / pairs,
         "error_max": float((image - exact).abs().max()),
-        "gradient_error": float((grad - exact_grad).norm() / exact_grad.norm()),
+        "gradient_error": float((grad - exact_grad).norm() / exact_grad.norm().clamp(min=1e-300)),
         **{f"share_{stage}": seconds[stage] / total for stage in STAGES},
     }  # fmt: skip
 

@@ -39,6 +39,14 @@ def test_rasterizer_rows_are_consistent(small, tmp_path, capsys):
     assert "M pairs contribute" in capsys.readouterr().out
 
 
+def test_of_a_scene_that_the_camera_does_not_see_all_figures_are_numbers(small, tmp_path, capsys):
+    small["means"][:, 2] = -5
+    arguments = ["--rounds", "1", "--threads", "1", "--dtypes", "float32", "--json"]
+    rasterizer.main(["-o", str(tmp_path), *arguments])
+    rows = json.loads(capsys.readouterr().out, parse_constant=lambda name: pytest.fail(name))["rows"]
+    assert {row["gradient_error"] for row in rows} == {0} and {row["contributing_pairs"] for row in rows} == {0}
+
+
 def test_a_file_that_holds_no_splats_is_named(tmp_path):
     path = tmp_path / "no.npz"
     path.write_text("text")
