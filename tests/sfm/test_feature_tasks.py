@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -141,3 +142,14 @@ def test_an_error_of_a_process_is_raised_and_ends_the_others(tmp_path: Path, mon
     assert len(children) == 2 and all(child.wait(60) for child in children)
     with pytest.raises(RuntimeError, match="FileNotFoundError"):
         engines.run_in_processes(feature_tasks.match_task, [str(tmp_path / "none")], "poses: matching", QUIET)
+
+
+def test_a_part_of_a_database_whose_path_is_no_utf8(tmp_path: Path) -> None:
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xe9"))
+    folder.mkdir()
+    feature_tasks.load_pycolmap().Database.open(folder / "all.db").close()
+    with closing(sqlite3.connect(folder / "all.db")) as database, database:
+        database.execute("INSERT INTO cameras VALUES (7, 1, 64, 48, x'00', 0)")
+    feature_tasks.write_part(folder / "all.db", [], folder / "part.db")
+    with closing(sqlite3.connect(folder / "part.db")) as part:
+        assert part.execute("SELECT camera_id FROM cameras").fetchall() == [(7,)]
