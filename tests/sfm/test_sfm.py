@@ -5,6 +5,7 @@ import os
 import sqlite3
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,8 +13,10 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from perception.errors import InputError
 from perception.geometry import align_similarity, inverse_se3
 from perception.inputs.load import load_scene
+from perception.photos.folder import PhotoSet
 from perception.photos.lens import load_pycolmap
 from perception.sfm import consistency, escalation, features, reconstruct
 from perception.sfm.consistency import Pair
@@ -182,6 +185,16 @@ def lacking(monkeypatch, photos):
 
     map_photos = reconstruct.map_photos
     monkeypatch.setattr(reconstruct, "map_photos", some)
+
+
+def test_a_model_without_points_is_refused(tmp_path, monkeypatch):
+    """As of a flat picture along which the camera moved: training would start from no Gaussians."""
+    model = load_pycolmap().Reconstruction()
+    found = SimpleNamespace(models=[model], contradicted=set(), registered=frozenset(range(5)))
+    monkeypatch.setattr(reconstruct, "_at_once", lambda *_: found)
+    store, chosen = SimpleNamespace(folder=tmp_path, facts={"seconds": {}}), PhotoSet([tmp_path] * 5)
+    with pytest.raises(InputError, match="photos: 5 of the 5 photos could be registered, in a model without points;"):
+        reconstruct._map(store, chosen, tmp_path / "photos", ReadOptions(tmp_path))
 
 
 def test_photos_left_out_are_added_and_an_interrupted_call_goes_on(corner, tmp_path, monkeypatch):
