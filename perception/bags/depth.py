@@ -11,7 +11,17 @@ import numpy as np
 
 from perception.bags.cameras import depth_camera
 from perception.bags.poses import Poses
-from perception.bags.read import DEPTH_TRANSPORT, IMAGES, Bag, first_frame, frame_of, kind_of, raw_rows, stamp_of
+from perception.bags.read import (
+    DEPTH_TRANSPORT,
+    IMAGES,
+    Bag,
+    first_frame,
+    first_message,
+    frame_of,
+    kind_of,
+    raw_rows,
+    stamp_of,
+)
 from perception.errors import InputError
 from perception.photos.decode import read_picture
 from perception.photos.depth import measured
@@ -35,8 +45,8 @@ _DEPTH = ("16UC1", "16SC1", "32FC1", "64FC1")
 
 def depth_topics(bag: Bag) -> list[str]:
     """Topics of depth images, by their first message: see `_holds_depth`."""
-    firsts = ((topic, next(bag.messages([topic]), None)) for topic in bag.of_type(*IMAGES))
-    return [topic for topic, first in firsts if first is not None and _holds_depth(topic, first.message)]
+    firsts = ((topic, first_message(bag, topic)) for topic in bag.of_type(*IMAGES))
+    return [topic for topic, first in firsts if first is not None and _holds_depth(topic, first)]
 
 
 def _holds_depth(topic: str, message: Any) -> bool:

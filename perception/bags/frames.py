@@ -15,7 +15,7 @@ import numpy as np
 from perception.bags.cameras import image_camera
 from perception.bags.depth import MILLIMETRES, choose_depth, depth_topics, write_depth
 from perception.bags.poses import FIXED_FRAMES, MAX_GAP, Poses, gravity, read_poses
-from perception.bags.read import IMAGES, Bag, decode_image, encoded, frame_of, open_bag, stamp_of
+from perception.bags.read import IMAGES, Bag, decode_image, encoded, first_message, frame_of, open_bag, stamp_of
 from perception.errors import InputError, shell_word
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
 from perception.inputs.transforms import lens_values
@@ -61,7 +61,8 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
         images = bag.of_type(*IMAGES)
         if not images:
             raise InputError(f"{bag.path}: holds no images; its topics are {', '.join(sorted(bag.topics)) or 'none'}")
-        pictures = images if options.topic else [t for t in images if t not in depths] or images
+        pictures = [t for t in images if t not in depths and first_message(bag, t) is not None] or images
+        pictures = images if options.topic else pictures
         topic = bag.chosen(pictures, options.topic, "image", "--topic")
         info = {} if options.camera is not None else image_camera(bag, topic, options.camera_info)
         lens = lens_of(info, topic) if options.camera is None else read_camera(options.camera)

@@ -161,9 +161,15 @@ def stamp_of(message: Any) -> int:
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
+def first_message(bag: Bag, topic: str) -> Any:
+    """The first message on a topic that can be read; None if there is none: recorders keep topics that were silent."""
+    return next((one.message for one in bag.messages([topic])), None)
+
+
 def first_frame(bag: Bag, topic: str) -> str:
-    """The tf frame of the first message on a topic; "" if there is none."""
-    return next((frame_of(one.message) for one in bag.messages([topic])), "")
+    """The tf frame of `first_message`; "" if there is none."""
+    message = first_message(bag, topic)
+    return "" if message is None else frame_of(message)
 
 
 def frame_of(message: Any) -> str:

@@ -100,6 +100,19 @@ def test_a_raw_depth_image_of_another_encoding(encoding: str, stored: np.ndarray
         assert facts["with_depth"] == COUNT and all(np.array_equal(d, MM) for d in depths(tmp_path / name))
 
 
+def test_topics_without_messages_are_not_asked_for(tmp_path: Path) -> None:
+    """As `ros2 bag record -a` leaves of cameras that are off."""
+
+    def silent(bag: Recorder, number: int, time: int) -> None:
+        for topic in ("/infra/image_raw", DEPTH):
+            if topic not in bag.topics:
+                bag.topics[topic] = bag.writer.add_connection(topic, "sensor_msgs/msg/Image", typestore=bag.store)
+
+    record(tmp_path / "a", depth=silent)
+    facts, _ = run_frames(tmp_path / "a", tmp_path / "out", ALL)
+    assert (facts["topic"], facts["chosen"], facts["depth"]) == (COLOR, COUNT, None)
+
+
 def test_of_two_depth_topics_one_is_asked_for_or_the_other_named(tmp_path: Path) -> None:
     other = "/cam/depth/image_far"
 
