@@ -6,6 +6,7 @@ All write pixel centres at whole numbers, so 0.5 is added to their principal poi
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -119,7 +120,7 @@ def _tum(source: Path) -> Recording:
     for time, photo, depth, near in zip(at, photos, nearest, apart <= TUM_APART, strict=True):
         pose = interpolated_pose(times, poses, time, TUM_GAP)
         if pose is not None and photo is not None:
-            name = photo.relative_to(source).as_posix()
+            name = Path(os.path.relpath(photo, source)).as_posix()  # lists may hold absolute paths
             frames.append(Frame(name, photo, depths[depth] if near else None, pose))
     if not frames:
         raise InputError(

@@ -47,6 +47,24 @@ def number(name: str, layout: str) -> int:
     return int("".join(c for c in digits if c.isdigit())) - (layout == "redwood")
 
 
+def test_lists_of_absolute_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = write_recording(tmp_path, "tum")
+    before = open_recording(source)
+    for name in ("rgb", "depth"):
+        file = source / f"{name}.txt"
+        file.write_text(file.read_text().replace(f" {name}/", f" {source}/{name}/"))
+    monkeypatch.chdir(tmp_path)
+    after = open_recording(Path(source.name))
+    assert [frame.name for frame in after.frames] == [frame.name for frame in before.frames]
+    (source / "rgb").rename(tmp_path / "elsewhere")
+    (source / "rgb.txt").write_text(
+        (source / "rgb.txt").read_text().replace(f"{source}/rgb/", f"{tmp_path}/elsewhere/")
+    )
+    with pytest.raises(InputError, match="'../elsewhere/100.100000.png' leaves its folder") as caught:
+        loaded(source, tmp_path)
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_hidden_files_that_macos_leaves_are_passed_over(layout: str, tmp_path: Path) -> None:
     source = write_recording(tmp_path, layout)
