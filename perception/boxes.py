@@ -45,11 +45,8 @@ def oriented_box(points: np.ndarray, trim: float = 0.0) -> OrientedBox:
 
 def _sides(axes: np.ndarray, points: np.ndarray, trim: float) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest coordinates [C, 3] of points along the rows of axes [C, 3, 3]."""
-    local = np.einsum("cij,pj->cpi", axes, points)
-    if trim:
-        low, high = np.quantile(local, [trim, 1 - trim], axis=1)
-        return low, high
-    return local.min(axis=1), local.max(axis=1)
+    low, high = np.quantile(np.einsum("cij,pj->cpi", axes, points), [trim, 1 - trim], axis=1)
+    return low, high
 
 
 def _hull(points: np.ndarray) -> np.ndarray | None:

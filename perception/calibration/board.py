@@ -124,34 +124,34 @@ class Board:
             raise InputError(f"--board is '{self.kind}'; expected charuco or checkerboard")
         if min(self.squares) < 3 or not self.square > 0:
             raise InputError(f"board of {self.squares[0]}x{self.squares[1]} squares of {self.square}: too small")
-        if self.kind == "charuco" and not 0 < self.marker < self.square:
+        if self.kind == "checkerboard":
+            return
+        if not 0 < self.marker < self.square:
             raise InputError(f"--marker is {self.marker}; expected a length above 0, under the square's {self.square}")
-        if self.kind == "charuco" and not hasattr(cv2.aruco, f"DICT_{self.dictionary}"):
+        if not hasattr(cv2.aruco, f"DICT_{self.dictionary}"):
             raise InputError(f"--dictionary '{self.dictionary}' is not known; expected OpenCV's, such as 5X5_100")
-        if self.kind == "charuco" and (needed := self.squares[0] * self.squares[1] // 2) > (held := self._markers()):
+        needed, held = self.squares[0] * self.squares[1] // 2, len(self._words().bytesList)
+        if needed > held:
             raise InputError(
                 f"--dictionary '{self.dictionary}' has {held} markers, a board of {self.squares[0]}x{self.squares[1]} "
                 f"squares needs {needed}; give the one that it was printed with"
             )
 
-    def _markers(self) -> int:
-        """Of the dictionary."""
-        return len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}")).bytesList)
+    def _words(self) -> Any:
+        return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
 
     @classmethod
     def from_text(cls, text: str) -> Board:
         """The board of "KIND:COLSxROWS:SQUARE[:MARKER[:DICTIONARY]]"; the marker is 3/4 of the square by default."""
         parts = text.split(":")
-        expected = "expected KIND:COLSxROWS:SQUARE[:MARKER[:DICTIONARY]] such as charuco:8x11:0.02"
         try:
             kind, squares, square, marker, dictionary = parts + [""] * (5 - len(parts))
             columns, rows = (int(side) for side in squares.lower().split("x"))
-            side = float(square)
-            return cls(kind, (columns, rows), side, float(marker or 0.75 * side), dictionary or "5X5_100")
-        except InputError:
-            raise
+            sides = float(square), float(marker or 0.75 * float(square))
         except ValueError as error:
+            expected = "expected KIND:COLSxROWS:SQUARE[:MARKER[:DICTIONARY]] such as charuco:8x11:0.02"
             raise InputError(f"board: found '{text}', {expected}") from error
+        return cls(kind, (columns, rows), *sides, dictionary or "5X5_100")
 
     def __str__(self) -> str:
         markers = f", markers {self.dictionary}" if self.kind == "charuco" else ""
@@ -171,10 +171,9 @@ class Board:
     def _detectors(self) -> list[tuple[Any, np.ndarray, np.ndarray]]:
         """(detector, corners, texture) of the current ChArUco pattern, and of the legacy pattern (OpenCV before 4.6),
         which differs for an even number of rows."""
-        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
         size, found = tuple(squares * PER_SQUARE + 2 * MARGIN for squares in self.squares), []
         for legacy in (False, True):
-            board = cv2.aruco.CharucoBoard(self.squares, self.square, self.marker, dictionary)
+            board = cv2.aruco.CharucoBoard(self.squares, self.square, self.marker, self._words())
             board.setLegacyPattern(legacy)
             texture = np.asarray(board.generateImage(size, None, MARGIN))
             found.append((cv2.aruco.CharucoDetector(board), np.asarray(board.getChessboardCorners()), texture))

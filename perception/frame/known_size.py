@@ -76,10 +76,8 @@ def scale_of_tags(views: Sequence[View], size: float) -> Measurement:
 
 def scale_of_board(views: Sequence[View], board: Board) -> Measurement:
     """Metres per unit from a calibration board; InputError when it is not seen in two photos."""
-    detected = (
-        (number, board.detect(view.name, read_grey(view.photo, view.as_stored))) for number, view in enumerate(views)
-    )
-    found = {number: detection for number, detection in detected if detection is not None}
+    detected = (board.detect(view.name, read_grey(view.photo, view.as_stored)) for view in views)
+    found = {number: detection for number, detection in enumerate(detected) if detection is not None}
     if len(found) < 2:
         raise InputError(f"board: the {board} is seen in {len(found)} of {len(views)} photos, at least 2 are needed")
     points = np.unique(np.concatenate([detection.board_points for detection in found.values()]), axis=0)

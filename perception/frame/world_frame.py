@@ -161,7 +161,7 @@ def upright(pose: np.ndarray, points: np.ndarray, gravity: Gravity, unit: float)
     up = -gravity.direction
     eye, ahead = camera_centres(pose[None])[0], pose[2, :3] - (pose[2, :3] @ up) * up
     if np.linalg.norm(ahead) < 0.3:  # it looks down or up: what is up in its photo lies ahead
-        ahead = -pose[1, :3] * np.sign(pose[2, :3] @ -up) + (pose[1, :3] @ up) * up * np.sign(pose[2, :3] @ -up)
+        ahead = ((pose[1, :3] @ up) * up - pose[1, :3]) * np.sign(pose[2, :3] @ -up)
     x = ahead / np.linalg.norm(ahead)
     axes = np.stack([x, np.cross(up, x), up])
     origin = eye + (floor_height(up, points, eye) - eye @ up) * up

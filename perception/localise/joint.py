@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from perception.geometry import camera_centres
 from perception.localise.keypoints import Described, triangulated
 from perception.localise.reference import Reference
 from perception.sfm.bundle_adjustment import Adjusted, Poses, adjust, residuals
@@ -108,5 +109,4 @@ def _with(poses: Poses, placed: dict[int, np.ndarray], count: int) -> Poses:
     """The map's poses, and `count` more; those that are not placed are the identity."""
     matrices = np.stack([placed.get(n, np.eye(4)) for n in range(count)])
     rotation = np.concatenate([poses.rotation, matrices[:, :3, :3]])
-    center = -np.einsum("nji,nj->ni", matrices[:, :3, :3], matrices[:, :3, 3])
-    return Poses(rotation, np.concatenate([poses.center, center]))
+    return Poses(rotation, np.concatenate([poses.center, camera_centres(matrices)]))

@@ -138,8 +138,7 @@ class Localiser:
         """As `localise`, with the reason for each photo that has no pose; one that cannot be read is among these.
         still: a folder for masks of what stays in the picture while the camera moves; None uses it as all else."""
         unread = {n: why for n, p in enumerate(photos) if (why := why_left_out(p.photo)) is not None}
-        usable = [n for n in range(len(photos)) if n not in unread]
-        chosen = [photos[n] for n in usable]
+        chosen = [photo for n, photo in enumerate(photos) if n not in unread]
         paths, own = [photo.photo for photo in chosen], [photo.mask for photo in chosen]
         stored = [photo.as_stored for photo in chosen]
         sizes = [photo_size(photo.photo, photo.as_stored) for photo in chosen]
@@ -148,9 +147,8 @@ class Localiser:
             self._progress.log(note)
         chosen = [replace(photo, mask=mask) for photo, mask in zip(chosen, masked.masks, strict=True)]
         with TemporaryDirectory(prefix="perception-localise-") as folder:
-            found = _Search(self._reference, chosen, Path(folder), self._progress).run() if usable else []
-        done = dict(zip(usable, found, strict=True))
-        return [done[n] if n in done else NotHere(p.name, p.photo, unread[n]) for n, p in enumerate(photos)]
+            found = iter(_Search(self._reference, chosen, Path(folder), self._progress).run() if chosen else [])
+        return [NotHere(p.name, p.photo, unread[n]) if n in unread else next(found) for n, p in enumerate(photos)]
 
 
 class _Search:

@@ -27,13 +27,12 @@ def localise_photos(
     if photos is not None and not photos.is_dir():
         raise InputError(f"{photos}: is no folder; give the one that holds the map's photos")
     gmap = Map.open(path)
-    with TemporaryDirectory(prefix="perception-localise-") as workdir:
-        new = new_photos(sources, camera, Path(workdir), show)
-    listed = [file for source in sources if source.is_dir() for file in input_files(source)]
-    refuse_inputs([output], [path, camera, *sources, *listed, *(photo.photo for photo in new)])
-    localiser = Localiser(gmap, photos, show)
-    with TemporaryDirectory(prefix="perception-localise-") as still:
-        answers = localiser.answers(new, Path(still))
+    with TemporaryDirectory(prefix="perception-localise-") as folder:
+        new = new_photos(sources, camera, Path(folder), show)
+        listed = [file for source in sources if source.is_dir() for file in input_files(source)]
+        refuse_inputs([output], [path, camera, *sources, *listed, *(photo.photo for photo in new)])
+        localiser = Localiser(gmap, photos, show)
+        answers = localiser.answers(new, Path(folder) / "still")
     facts = {"photos": [answer_json(answer) for answer in answers], "frame": gmap.frame, "metric": gmap.metric}
     facts |= {"map_id": gmap.map_id, "rendered": localiser.rendered}
     found = [answer for answer in answers if isinstance(answer, Localised)]

@@ -75,12 +75,11 @@ class Looks:
             for element in point.track.elements:
                 if element.image_id in seen:
                     seen[element.image_id][number] = model.images[element.image_id].points2D[element.point2D_idx].xy
-        photos = {image: (model.images[image], points) for image, points in seen.items()}
-        xyz = {number: point.xyz for number, point in model.points3D.items()}
-        made = {
-            i: (loaded(root / of.name), of.camera, of.cam_from_world().matrix(), at) for i, (of, at) in photos.items()
-        }
-        return cls(xyz, {image: Photo(*each) for image, each in made.items()})
+        photos = {}
+        for image, points in seen.items():
+            of = model.images[image]
+            photos[image] = Photo(loaded(root / of.name), of.camera, of.cam_from_world().matrix(), points)
+        return cls({number: point.xyz for number, point in model.points3D.items()}, photos)
 
     @cached_property
     def usual(self) -> np.ndarray:

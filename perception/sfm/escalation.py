@@ -282,10 +282,9 @@ class Escalation:
             best = self._adjusted([best], store)
         self.known += [best, *models[1:]]
         had, largest = set(best.reg_image_ids()), best.num_reg_images()
-        new = {
-            model: len(set(model.reg_image_ids()) - had) for model in models[1:] if model.num_reg_images() <= largest
-        }
-        kept = Candidate([best, *(each for each in new if new[each] >= MIN_MODEL_SIZE)], contradicted, store)
+        others = [model for model in models[1:] if model.num_reg_images() <= largest]
+        others = [model for model in others if len(set(model.reg_image_ids()) - had) >= MIN_MODEL_SIZE]
+        kept = Candidate([best, *others], contradicted, store)
         if not again or largest == complete:
             return kept
         grown = self._grown(self._adjusted([best], store), store, again=False, joined=joined)

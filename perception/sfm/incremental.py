@@ -112,7 +112,7 @@ class _Mapping:
                 yield self._without_outvoted(again)
 
     def _database_without(self, pairs: list[Pair]) -> Path:
-        copy = self.folder / f"pairs-{self.runs}.db"
+        copy = self.folder / "pairs.db"
         shutil.copyfile(self.store.database, copy)
         delete_pairs(copy, [(pair.i, pair.j) for pair in pairs])
         return copy

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import shutil
 import time
+from collections import defaultdict
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -152,18 +153,17 @@ def _report(found: Candidate, shown: list[str], seconds: dict[str, float]) -> di
 
 def _best_partners(store: FeatureStore) -> dict[str, tuple[int, int]]:
     """name -> (features, geometrically verified matches with the best partner)."""
-    with load_pycolmap().Database.open(store.database) as db:
-        ids = {image.image_id: image.name for image in db.read_all_images()}
-        features = {image_id: (name, db.num_keypoints_for_image(image_id)) for image_id, name in ids.items()}
-    best = dict.fromkeys(features, 0)
+    best = defaultdict[int, int](int)
     for pair, matches in verified_matches(store.database).items():
-        for image_id in pair:
-            best[image_id] = max(best[image_id], len(matches))
-    return {name: (count, best[image_id]) for image_id, (name, count) in features.items()}
+        for image in pair:
+            best[image] = max(best[image], len(matches))
+    with load_pycolmap().Database.open(store.database) as db:
+        ids = {image.name: image.image_id for image in db.read_all_images()}
+        return {name: (db.num_keypoints_for_image(image), best[image]) for name, image in ids.items()}
 
 
 def _reason(name: str, contradicted: set[str], others: list[set[str]], matches: dict[str, tuple[int, int]]) -> str:
-    features, best = matches.get(name, (0, 0))
+    features, best = matches[name]
     if name in contradicted:
         return "most of its verified matches contradict every pose found for it (equal textures?)"
     if any(name in other for other in others):
