@@ -118,6 +118,11 @@ class _Problem:
     depth_sigma: float
     held: np.ndarray
 
+    @property
+    def free(self) -> np.ndarray:
+        """The rows of the poses that are adjusted among the [6N] of all."""
+        return np.flatnonzero(np.repeat(~self.held, 6))
+
 
 @dataclass(frozen=True)
 class Adjusted:
@@ -130,11 +135,10 @@ class Adjusted:
     def covariances(self) -> np.ndarray:
         """[K, 6, 6] of the K poses that are not held, each as `Poses.turned` takes its change; of points as well as
         poses: the blocks of the inverse of the reduced normal matrix (Triggs et al. 2000, section 6.1)."""
-        free = np.flatnonzero(~self._problem.held)
-        rows = (6 * free[:, None] + np.arange(6)).ravel()
-        reduced = _normal(self._problem, self.poses, self.points, 0.0)[0]
-        inverse = np.linalg.inv(reduced[rows][:, rows].toarray()).reshape(len(free), 6, len(free), 6)
-        return np.asarray(inverse[np.arange(len(free)), :, np.arange(len(free))])
+        free = self._problem.free
+        count, reduced = len(free) // 6, _normal(self._problem, self.poses, self.points, 0.0)[0]
+        inverse = np.linalg.inv(reduced[free][:, free].toarray()).reshape(count, 6, count, 6)
+        return np.asarray(inverse[np.arange(count), :, np.arange(count)])
 
 
 def _normalised(problem: _Problem, poses: Poses, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -166,7 +170,8 @@ def _step(problem: _Problem, poses: Poses, points: np.ndarray, damping: float) -
     """One damped step: delta [N, 6] of the poses, shift [P, 3] of the points."""
     reduced, right, V_inverse, g_point, W = _normal(problem, poses, points, damping)
     reduced.setdiag(reduced.diagonal() * (1 + damping))
-    delta = _solved(reduced, right)
+    delta, free = np.zeros(len(right)), problem.free
+    delta[free] = _solved(reduced[free][:, free], right[free])  # priors tie held poses to the others
     shift = np.einsum("pij,pj->pi", V_inverse, g_point - (W.T @ delta).reshape(-1, 3))
     return delta.reshape(-1, 6), shift
 
