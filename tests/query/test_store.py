@@ -277,6 +277,15 @@ def test_what_is_written_into_a_hit_changes_no_other_answer(store: Path) -> None
     assert opened.query("mug", 1, 0.0)[0].to_json() == before != first.to_json()
 
 
+def test_the_views_of_a_map_are_read_once_for_all_hits(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened, read = load_map(store, encoders), list[int]()
+    expected = [hit.views for hit in opened.query("mug", 1000, 0.0)]
+    fresh, parse = load_map(store, encoders), json.loads
+    monkeypatch.setattr("json.loads", lambda text: read.append(len(text)) or parse(text))
+    assert [hit.views for hit in fresh.query("mug", 1000, 0.0)] == expected
+    assert len(expected) > 20 and len(read) <= len(fresh.maps)
+
+
 def test_a_hit_in_a_frame_with_another_unit_is_not_metric(store: Path) -> None:
     hits = load_map(store, encoders).query("mug", min_score=0.0)
     assert {hit.metric for hit in hits} == {True, False}
