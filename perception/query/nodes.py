@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from perception.query.hit import Hit
 from perception.query.instance_set import InstanceSet
 from perception.query.ranking import PRESENT, Ranker, evidence_of
 from perception.query.relations import parse
+from perception.query.text_ranking import REMEMBERED
 from perception.query.where import Where
 
 CLEAR = 1.2  # least difference of `evidence_of` to every instance that shares points with the part or the group
@@ -48,6 +49,7 @@ class Nodes:
 
     def __init__(self, gmap: Map, wholes: InstanceSet, ranker: Callable[[], Ranker]) -> None:
         self._gmap, self._wholes, self._ranker_of_instances = gmap, wholes, ranker
+        self._scored = lru_cache(REMEMBERED)(self._scores)
         row_of = {entry["id"]: n for n, entry in enumerate(gmap.instances)}
         self._kinds: list[InstanceSet] = []
         self._nodes: list[Node] = []
@@ -74,6 +76,11 @@ class Nodes:
         groups = [from_arrays(language)[0] for language in (self._gmap.language, *(k.language for k in self._kinds))]
         return self._ranker_of_instances().over([description for group in groups for description in group])
 
+    def _scores(self, text: str) -> tuple[np.ndarray, np.ndarray]:
+        """Scores of the instances, then all nodes, for a prompt, and their `evidence_of`."""
+        scores = self._ranker.scores(text)
+        return scores, evidence_of(scores)
+
     def fitting(self, text: str, hits: list[tuple[int, float]], where: Where) -> list[Candidate]:
         """`hits` of all instances, best first, with the nodes that fit clearly better instead of the instances that
         they share points with; parts only if the encoder knows more than whole objects. Labels of the user and texts on
@@ -82,16 +89,15 @@ class Nodes:
         special = shape_kind(text) or parse(text) or quoted_text(text)
         if not self._nodes or not hits or special or hits[0][1] == 1.0:
             return list(hits)
-        score, count = dict(self._ranker.rank(text).hits), len(hits)
-        z = {n: float(evidence_of(np.array(s))) for n, s in score.items()}
+        scores, z = self._scored(" ".join(text.split()))
         chosen, replaced = list[Candidate](), set[int]()
         wholes = self._ranker.encoder.reading.wholes
-        for n, node in enumerate(self._nodes, start=count):
+        for n, node in enumerate(self._nodes, start=len(hits)):
             if node.is_part and wholes:
                 continue
-            clear = score[n] >= PRESENT and z[n] >= CLEAR + max(z[i] for i in node.rows)
+            clear = scores[n] >= PRESENT and z[n] >= CLEAR + z[node.rows].max()
             labelled = all(self._wholes.has_label(i, where.labels) for i in node.rows)
             if clear and labelled and node.kind.fulfils(node.row, replace(where, labels=None)):
-                chosen.append((node, score[n]))
+                chosen.append((node, float(scores[n])))
                 replaced.update(node.rows)
         return sorted([*chosen, *(hit for hit in hits if hit[0] not in replaced)], key=lambda hit: -hit[1])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -84,6 +86,21 @@ def test_a_filter_applies_to_nodes_by_their_own_points_and_the_labels_of_their_i
         assert gmap.query("handle", where=Where(labels=["mug"]))[0].part == 20
     finally:
         del gmap.instances[0]["label"]
+
+
+def test_a_prompt_that_is_repeated_is_not_encoded_again(path: Path) -> None:
+    class Counting(HashEncoder):
+        asked: ClassVar[list[str]] = []
+
+        def encode_texts(self, texts: Sequence[str]) -> np.ndarray:
+            self.asked.extend(texts)
+            return super().encode_texts(texts)
+
+    gmap = load_map(path, lambda _: Counting())
+    hits = [hit.to_json() for hit in gmap.query("handle")]
+    assert hits[0]["part"] == 20
+    before = len(Counting.asked)
+    assert [hit.to_json() for hit in gmap.query(" handle ")] == hits and len(Counting.asked) == before
 
 
 def test_only_groups_whose_members_all_stand_today_answer(tmp_path: Path) -> None:
