@@ -8,6 +8,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
+from perception.geometry import sums_by
 from perception.language.description import from_arrays
 from perception.language.printed import quoted_text
 from perception.language.shape_words import shape_kind
@@ -61,7 +62,9 @@ class Nodes:
             self._add(kind, True, [[row_of[part["parent"]]] for part in parts])
         if (language := language_in(gmap.groups)) and (gmap.group_ids >= 0).any():
             ids, groups = gmap.group_ids, range(len(gmap.groups["scores"]))
-            centroids = [np.average(gmap.means[ids == g], axis=0, weights=gmap.opacities[ids == g]) for g in groups]
+            weights = gmap.opacities.astype(np.float64)
+            sums = sums_by(ids + 1, np.c_[gmap.means, np.ones(len(ids))], len(groups) + 1, weights)[1:]
+            centroids = sums[:, :3] / np.maximum(sums[:, 3:], 1e-12)
             kind = InstanceSet(gmap, [{"id": g, "score": 1.0, "centroid": centroids[g]} for g in groups], language, ids)
             self._add(kind, False, [np.flatnonzero(gmap.groups["of"] == g).tolist() for g in groups])
 

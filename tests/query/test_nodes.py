@@ -61,7 +61,7 @@ def test_a_prompt_is_answered_by_the_node_that_it_names(gmap: QueryMap) -> None:
     members = gmap.means[np.isin(gmap.instance_ids, [5, 6])]
     np.testing.assert_array_equal(np.sort(both.points, axis=0), np.sort(members, axis=0))
     weights = 1 / (1 + np.exp(-gmap.opacity_logits[np.isin(gmap.instance_ids, [5, 6])].astype(np.float64)))
-    np.testing.assert_allclose(both.centroid, weights @ members / weights.sum(), rtol=1e-5)
+    np.testing.assert_allclose(both.centroid, weights @ members / weights.sum(), rtol=1e-6)
     assert "part" not in mug.to_json() and "instances" not in mug.to_json()
     assert {hit.instance_id for hit in gmap.query("handle", min_score=0.0)} == set(range(3, 12))  # instances alone
 
