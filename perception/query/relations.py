@@ -12,7 +12,7 @@ and "behind" are as most photos that show both see them. If the other thing is n
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,6 +28,7 @@ from perception.query.ranking import PRESENT, Answer, Scorer
 TRIM = 0.02  # share of an instance's points left out of its box at either end of each axis
 WEIGHT = 3.0  # added to z for a full match, in standard deviations of the map's probes
 NESTED = 3  # relations that are read in the name of the other thing; each costs as much as a prompt
+ROWS = 256  # instances whose boxes are compared with all others at a time
 _KINDS = {
     "on": ("on top of", "on", "upon"),
     "under": ("under", "underneath", "beneath", "below"),
@@ -108,8 +109,9 @@ def fulfilled(
     best = np.zeros(len(score))
     for own, boxes in maps:
         if score[own].max(initial=0.0) >= PRESENT:
-            others = score[own] * further[own]
-            best[own] = (boxes.match(relation.kind) * others[None]).max(axis=1, initial=0.0)
+            others, of_map = score[own] * further[own], best[own]
+            for rows, match in boxes.matches(relation.kind):
+                of_map[rows] = (match * others[None]).max(axis=1, initial=0.0)
     return best
 
 
@@ -145,44 +147,56 @@ class LevelBoxes:
 
     def match(self, kind: str) -> np.ndarray:
         """g [I, I] in [0, 1]: how well the row's instance is in the relation to the column's; 0 to itself."""
-        return self._match(kind) * (1 - np.eye(len(self.lows))) if len(self.lows) else np.zeros((0, 0))
+        whole = np.zeros((len(self.lows), len(self.lows)))
+        for rows, match in self.matches(kind):
+            whole[rows] = match
+        return whole
 
-    def _match(self, kind: str) -> np.ndarray:
-        low, high = self.lows[:, None], self.highs[:, None]
+    def matches(self, kind: str) -> Iterator[tuple[slice, np.ndarray]]:
+        """The rows of `match`, ROWS at a time: memory does not grow with the square of the instances."""
+        for start in range(0, len(self.lows), ROWS):
+            match = self._match(kind, rows := slice(start, start + ROWS))
+            match[np.arange(len(match)), start + np.arange(len(match))] = 0
+            yield rows, match
+
+    def _match(self, kind: str, rows: slice) -> np.ndarray:
+        low, high = self.lows[rows, None], self.highs[rows, None]
         other_low, other_high = self.lows[None], self.highs[None]
-        size = np.maximum(self.highs - self.lows, 1e-9)
+        other_size = np.maximum(self.highs - self.lows, 1e-9)
+        size = other_size[rows]
         shared = np.clip(np.minimum(high, other_high) - np.maximum(low, other_low), 0, None) / size[:, None]
         covered = shared[..., 0] * shared[..., 1]  # share of its footprint that lies over or under the other's
-        tall, other_tall = size[:, None, 2], size[None, :, 2]
-        slack = 0.25 * np.minimum(tall, other_tall) + 0.02 * np.median(size.max(axis=1))
+        tall, other_tall = size[:, None, 2], other_size[None, :, 2]
+        slack = 0.25 * np.minimum(tall, other_tall) + 0.02 * np.median(other_size.max(axis=1))
         below, top = low[..., 2] - other_high[..., 2], other_low[..., 2] + 0.2 * other_tall
         if kind == "on":
             return covered * ramp(below, 2 * slack, slack) * ramp(top - low[..., 2], slack, 0 * slack)
-        area = size[:, 0] * size[:, 1]
-        stacked = np.minimum(1, covered * area[:, None] / np.minimum(area[:, None], area[None]))  # of the smaller one's
+        area, other_area = size[:, 0] * size[:, 1], other_size[:, 0] * other_size[:, 1]
+        smaller = np.minimum(area[:, None], other_area[None])
+        stacked = np.minimum(1, covered * area[:, None] / smaller)  # share of the smaller footprint
         if kind == "above":
             return stacked * ramp(-below, 2 * slack, slack)
         if kind == "under":
-            middle = (self.lows + self.highs)[:, None, 2] / 2
+            middle = (low + high)[..., 2] / 2
             return stacked * ramp(middle - other_high[..., 2], 0 * slack, -slack)
         if kind == "in":
             return covered * shared[..., 2]
         gaps = np.clip(np.maximum(other_low - high, low - other_high), 0, None)
-        gap, reach = np.linalg.norm(gaps, axis=2), (size.max(axis=1)[:, None] + size.max(axis=1)[None]) / 2
+        gap, reach = np.linalg.norm(gaps, axis=2), (size.max(axis=1)[:, None] + other_size.max(axis=1)[None]) / 2
         if kind == "beside":
             return ramp(gap, 1.5 * reach, 0.25 * reach) * (1 - stacked)
-        return ramp(gap, 6 * reach, reach) * np.clip(2 * self._seen(kind) - 1, 0, 1)
+        return ramp(gap, 6 * reach, reach) * np.clip(2 * self._seen(kind, rows) - 1, 0, 1)
 
-    def _seen(self, kind: str) -> np.ndarray:
-        """[I, I]: share of the photos showing both in which the row's instance is left, right, in front or behind."""
-        middles, count = (self.lows + self.highs) / 2, len(self.lows)
-        yes, all_ = np.zeros((2, count, count))
+    def _seen(self, kind: str, rows: slice) -> np.ndarray:
+        """[R, I]: share of the photos showing both in which the row's instance is left, right, in front or behind."""
+        middles = (self.lows + self.highs) / 2
+        yes, all_ = np.zeros((2, len(middles[rows]), len(middles)))
         for pose in self.poses:
             x, y, z = pose[:3, :3] @ middles.T + pose[:3, 3:]
             ahead = (z > 0) & (np.maximum(np.abs(x), np.abs(y)) < z)  # within 45° of the axis
             x = x / np.maximum(z, 1e-9)
             value = {"left": -x, "right": x, "front": -z, "behind": z}[kind]
-            both = ahead[:, None] & ahead[None]
-            yes += both & (value[:, None] > value[None])
+            both = ahead[rows, None] & ahead[None]
+            yes += both & (value[rows, None] > value[None])
             all_ += both
         return (yes + 0.5) / (all_ + 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from perception.language.description import InstanceDescription
 from perception.language.negation import negation_in
 from perception.language.printed import Printed
+from perception.query import relations
 from perception.query.ranking import Ranker, answering
 from perception.query.relations import LevelBoxes, Relation, parse, ranked
 
@@ -108,6 +110,22 @@ def test_relations_of_a_made_desk(kind: str, pairs: set[tuple[str, str]]) -> Non
     assert match.shape == (5, 5) and match.min() >= 0 and match.max() <= 1
     assert {(NAMES[i], NAMES[j]) for i, j in zip(*np.nonzero(match > 0.3), strict=True)} == pairs
     assert not np.diagonal(match).any()
+
+
+@pytest.mark.parametrize("kind", ["on", "beside", "left"])
+def test_relations_of_many_are_those_of_few_and_take_little_memory(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    few = _desk().match(kind)
+    monkeypatch.setattr(relations, "ROWS", 2)
+    assert np.array_equal(_desk().match(kind), few)
+    monkeypatch.setattr(relations, "ROWS", 64)
+    lows = np.random.default_rng(0).uniform(0, 30, (1000, 3))
+    many, most = LevelBoxes(lows, lows + 0.5, np.eye(4)[None]), 0.0
+    tracemalloc.start()
+    for _, match in many.matches(kind):
+        most = max(most, float(match.max()))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most > 0 and peak < 16e6  # of [1000, 1000, 3] float64 one array has 24 MB
 
 
 def test_beside_is_near_and_not_stacked() -> None:
