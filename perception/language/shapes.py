@@ -99,7 +99,9 @@ def shape_scores(
     scores = np.zeros((len(wanted), len(KINDS)))
     up = up_from_cameras(camera_from_world) if gravity is None else -gravity.direction
     frame = level_frame(np.array([0.0, 0.0, 1.0]) if up is None else up)
-    measured = [measure(means[instance_ids == i] @ frame.T) for i in wanted]
+    order = np.argsort(instance_ids, kind="stable")
+    starts, ends = (np.searchsorted(instance_ids, wanted, side, order) for side in ("left", "right"))
+    measured = [measure(means[order[a:b]] @ frame.T) for a, b in zip(starts, ends, strict=True)]
     rows = [n for n, body in enumerate(measured) if body is not None]
     bodies = [body for body in measured if body is not None]
     if not bodies:
@@ -204,7 +206,8 @@ def _rise(x: Any, bounds: tuple[float, float], unit: float = 1.0, base: float = 
 def room_scores(bodies: list[Body], eyes: float) -> dict[str, np.ndarray]:
     """Scores [B] of the kinds that depend on the other instances. eyes: median height of the cameras."""
     tilt = np.abs([body.normal[2] for body in bodies])
-    height = np.array([body.center[2] for body in bodies])
+    centers = np.array([body.center for body in bodies])
+    height = centers[:, 2]
     thickness, area, low, high, top, top_share = (
         np.array([getattr(body, name) for body in bodies])
         for name in ("thickness", "area", "low", "high", "top", "top_share")
@@ -227,7 +230,7 @@ def room_scores(bodies: list[Body], eyes: float) -> dict[str, np.ndarray]:
     carries = (upright > CERTAIN) & (area >= WALL_OF_PICTURE * largest_upright)
     walls = [body for body, wall in zip(bodies, carries, strict=True) if wall]
     gap = np.array([min((_gap(body, wall) for wall in walls if wall is not body), default=np.inf) for body in bodies])
-    rests = np.array([sum(_rests_on(other, body, span) for other in bodies if other is not body) for body in bodies])
+    rests = np.array([_resting(body, centers, area, low, span).sum() for body in bodies])
     raised = np.where(floor, 0.5, _rise(top, TABLE_HEIGHT, span, ground) if known else 1.0)
     wall = upright * ramp(area / largest_upright, *WALL_OF_UPRIGHT) * ramp(area / largest, *WALL_OF_LARGEST)
     wall *= _rise(high - low, WALL_HEIGHT, span)
@@ -266,10 +269,10 @@ def _slab(points: np.ndarray) -> tuple[float, float, np.ndarray]:
     return float(np.median(held[:, 2])), float(counts[start] / len(points)), rectangle
 
 
-def _rests_on(upper: Body, lower: Body, span: float) -> bool:
-    """Whether a smaller body stands on the top slab of `lower`."""
-    inside = ((upper.center[:2] > lower.footprint[0]) & (upper.center[:2] < lower.footprint[1])).all()
-    return bool(inside and upper.area < lower.area and abs(upper.low - lower.top) < RESTING * span)
+def _resting(body: Body, centers: np.ndarray, area: np.ndarray, low: np.ndarray, span: float) -> np.ndarray:
+    """[B] bool: which of the bodies with these centers [B, 3], areas and lows [B] are smaller and stand on its top."""
+    inside = ((centers[:, :2] > body.footprint[0]) & (centers[:, :2] < body.footprint[1])).all(axis=1)
+    return inside & (area < body.area) & (np.abs(low - body.top) < RESTING * span)
 
 
 def _gap(body: Body, wall: Body) -> float:

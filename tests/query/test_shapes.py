@@ -7,7 +7,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from perception.language.shape_words import KINDS, head_noun, shape_kind
-from perception.language.shapes import boxiness, covered_area, roundness, shape_scores, up_from_cameras
+from perception.language.shapes import (
+    RESTING,
+    Body,
+    _resting,
+    boxiness,
+    covered_area,
+    roundness,
+    shape_scores,
+    up_from_cameras,
+)
 from support.aimed import look_at
 
 
@@ -165,3 +174,23 @@ def test_rolled_cameras_tell_no_up() -> None:
 )
 def test_head_nouns(text: str, noun: str, kind: str | None) -> None:
     assert head_noun(text) == noun and shape_kind(text) == kind
+
+
+def test_what_stands_on_a_body_is_smaller_above_its_slab_and_touches_it() -> None:
+    rng, no_points, up = np.random.default_rng(0), np.zeros((0, 3)), np.eye(3)[2]
+    bodies = [
+        Body(no_points, center, up, 0.1, area, low, low + 1, top, 0.5, np.array([center[:2] - 0.5, center[:2] + 0.5]))
+        for center, area, low, top in zip(rng.uniform(0, 2, (60, 3)), *rng.uniform(0, 1, (3, 60)), strict=True)
+    ]
+    centers, area, low = (np.array([getattr(body, name) for body in bodies]) for name in ("center", "area", "low"))
+    found = [_resting(body, centers, area, low, 2.0).tolist() for body in bodies]
+    expected = [
+        [
+            all(b.footprint[0][k] < a.center[k] < b.footprint[1][k] for k in (0, 1))
+            and a.area < b.area
+            and abs(a.low - b.top) < RESTING * 2.0
+            for a in bodies
+        ]
+        for b in bodies
+    ]
+    assert found == expected and np.any(expected)
