@@ -17,8 +17,7 @@ from pydantic.fields import FieldInfo
 
 from perception.errors import InputError, refuse_named_pipe
 
-LARGEST_SEED = 2**31 - 1
-"""COLMAP's random generator takes 32-bit signed seeds."""
+LARGEST_SEED = 2**31 - 1  # COLMAP's random generator takes 32-bit signed seeds
 
 
 class Settings(BaseModel):
@@ -191,9 +190,8 @@ class LanguageConfig(Settings):
 
 
 class MapConfig(Settings):
-    """All settings of `perception map`. The descriptions and ranges are what `perception map --help` prints.
-
-    Made by `load_config`, which raises InputError for a setting that is unknown or out of range.
+    """All settings of `perception map`, whose --help prints descriptions and ranges. Made by `load_config`, which
+    raises InputError for a setting that is unknown or out of range.
 
     >>> MapConfig(seed=3).to_json()["seed"]
     3
@@ -254,9 +252,7 @@ PAPER: dict[str, Any] = {
 }
 """OpenSplat3D as published: 30k iterations, each training all parameters at full resolution (3DGS reduces photos wider
 than 1600 pixels), with the densification threshold of the authors' LERF configuration; then HDBSCAN of the features
-alone. β, λ_inst2d, the growth of the crops (.3) and the threshold of silhouettes (.2) are constants, the paper's.
-What still differs from the paper is listed in docs/benchmarks.md.
-"""
+alone. docs/benchmarks.md lists what still differs from the paper."""
 
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
@@ -344,8 +340,8 @@ def settings_text() -> str:
     """All settings with default, range and effect, user settings first, for `--help`."""
     lines: dict[bool, list[str]] = {False: [], True: []}
     for key, field in fields(MapConfig):
-        default = field.default
-        default = "none" if default is None else str(default).lower() if isinstance(default, bool) else default
+        default = "none" if field.default is None else field.default
+        default = str(default).lower() if isinstance(default, bool) else default
         lines[key.startswith(METHOD)] += [f"  {key}={default}  ({expected(field)})", f"      {field.description}"]
     head = "settings, for --set KEY=VALUE and --config FILE.toml:"
     return "\n".join([head, *lines[False], "settings that vary the method, for experiments:", *lines[True]])

@@ -131,8 +131,8 @@ def _scheduled() -> int:
 
 
 def _control_groups(controller: str) -> Iterator[Path]:
-    """Folders of this process's control group and of those above it that limit "cpu" or "memory", versions 1 and 2.
-    In a container the group's own path does not exist, and its folder is the root."""
+    """Folders of this process's control group and of those above it that limit "cpu" or "memory", versions 1 and 2; in
+    a container they may not exist, but for the root."""
     try:
         lines = [line.split(":", 2) for line in _OWN.read_text(encoding="utf-8").splitlines()]
     except OSError:

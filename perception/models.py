@@ -124,10 +124,8 @@ def add_model(name: str, sources: Sequence[str]) -> StoredModel:
 
 
 def get_model(name: str, progress: Progress = QUIET) -> StoredModel:
-    """Fetches an entry of the catalogue from the Hugging Face hub into the store under its name, unless it is there.
-
-    HF_ENDPOINT names a mirror of the hub. Files are verified by their known digests.
-    """
+    """Fetches an entry of the catalogue from the Hugging Face hub, or its mirror HF_ENDPOINT, into the store under its
+    name, unless it is there. Files are verified by their known digests."""
     entry = catalogue().get(name)
     if entry is None:
         raise InputError(f"models get {name}: not in the catalogue; it holds {', '.join(catalogue())}")
@@ -186,16 +184,16 @@ def _local(source: str) -> list[tuple[str, Path, str]]:
         return [(str(f.relative_to(root)), f, str(f)) for f in files]
     if not path.is_file():
         raise InputError(f"{source}: no such file or folder")
+    files = [path]
     if path.suffix == ".onnx":
         refuse_outside_weights(path)
-    beside = side_files(path) if path.suffix == ".onnx" else []
-    return [(str(p.relative_to(path.parent)), p, str(p)) for p in [path, *beside] if p.is_file()]
+        files += [file for file in side_files(path) if file.is_file()]
+    return [(str(p.relative_to(path.parent)), p, str(p)) for p in files]
 
 
 def _install(name: str, files: Sequence[tuple[str, Path, str]]) -> StoredModel:
     names = [file_name for file_name, _, _ in files]
-    twice = {n for n in names if names.count(n) > 1}
-    if twice:
+    if twice := {n for n in names if names.count(n) > 1}:
         raise InputError(f"models add {name}: two files are called {', '.join(sorted(twice))}; rename one")
     if not any(n.endswith(".onnx") for n in names):
         raise InputError(f"models add {name}: no .onnx file among {', '.join(names) or 'nothing'}")

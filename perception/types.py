@@ -11,10 +11,8 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Lens:
-    """The camera that took a photo, as COLMAP names it: model (e.g. "OPENCV"), params in COLMAP's order.
-
-    width, height: size in pixels of the photo as its view uses it (see `View.as_stored`).
-    """
+    """The camera that took a photo, as COLMAP names it: model (e.g. "OPENCV"), params in COLMAP's order. width, height:
+    size in pixels of the photo as its view uses it (see `View.as_stored`)."""
 
     model: str
     params: tuple[float, ...]
@@ -70,9 +68,9 @@ class View:
 class Scene:
     """Input of mapping: posed views (sorted by name) and a sparse cloud.
 
-    points: [P, 3] float64 in the world frame; point_colors: [P, 3] uint8; both may be empty.
-    metric: True when the unit is known to be the metre. report: JSON-able facts about the reconstruction
-    (registered photos, left-out photos and reasons, reprojection error, warnings, seconds by stage).
+    points: [P, 3] float64 in the world frame; point_colors: [P, 3] uint8; both may be empty. metric: whether the unit
+    is known to be the metre. report: JSON-able facts about the reconstruction (registered and left-out photos, errors,
+    warnings, seconds by stage).
     """
 
     views: list[View]
@@ -114,11 +112,8 @@ class OrientedBox:
 
 @dataclass
 class PointCloud:
-    """Points as read, order kept. points [P, 3] float32 or float64; the rest may be None.
-
-    colors [P, 3] uint8, normals [P, 3] float32, faces [F, 3] int32 (mesh), labels: further columns [P] of numbers by
-    name, in the type that the file has.
-    """
+    """Points as read, order kept. points [P, 3] float32 or float64; colors [P, 3] uint8, normals [P, 3] float32, faces
+    [F, 3] int32 (mesh), labels: further columns [P] of numbers by name, in the type that the file has."""
 
     points: np.ndarray
     colors: np.ndarray | None = None

@@ -28,30 +28,20 @@ from perception.export.neighbors import Neighbors, list_normals, neighbor_lists
 from perception.geometry import sums_by, transform
 from perception.types import PointCloud
 
-SCALES = 2.0 ** np.arange(-2, 1.51, 1 / 9)
-"""Scales to try around the ratio of the extents, 8 % apart."""
-GRID = 28
-"""Voxels of the correlation along the map's diagonal, divided by √3 in a cube."""
-LARGEST_SCAN = 12
-"""Times the map's diagonal: the correlation of a larger scan takes gigabytes."""
-REFINED, JUDGED = 100, 16
-"""Places that are refined with few points and views, and the best of them, refined with more."""
-FINALISTS = 3
-"""Places apart from each other that are refined with all points and colours."""
+SCALES = 2.0 ** np.arange(-2, 1.51, 1 / 9)  # scales to try around the ratio of the extents, 8 % apart
+GRID = 28  # voxels of the correlation along the map's diagonal, divided by √3 in a cube
+LARGEST_SCAN = 12  # times the map's diagonal: the correlation of a larger scan takes gigabytes
+REFINED, JUDGED = 100, 16  # places that are refined with few points and views, and the best of them, refined with more
+FINALISTS = 3  # places apart from each other that are refined with all points and colours
 FEW_ROWS, ROWS, FINE_ROWS = 500, 1500, 20_000
 """Points of the scan in the steps: the first refinement, the second and judging, the last refinement."""
-FEWEST, FEWEST_IN_VIEW = 30, 50
-"""Points below which nothing is fitted or correlated: of all views, of one view."""
-TOLERANCE = 1 / 60
-"""Distance in extents of the map within which a scan point lies on the rendered surface."""
-ELSEWHERE = 0.1
-"""Root mean square distance in extents of the scan's points in one pose to those in another pose."""
+FEWEST, FEWEST_IN_VIEW = 30, 50  # points below which nothing is fitted or correlated: of all views, of one view
+TOLERANCE = 1 / 60  # distance in extents of the map within which a scan point lies on the rendered surface
+ELSEWHERE = 0.1  # root mean square distance in extents of the scan's points in one pose to those in another pose
 LEAST_AGREEMENT, LEAST_COVER, MOST_RIVAL, LEAST_STIFFNESS, LEAST_LIKENESS = 0.95, 0.05, 0.85, 1e-3, 0.5
 """Bounds of the figures of an `Alignment` that is accepted."""
-FACING = 0.7
-"""Least cosine of the normals of points that are matched."""
-LEAST_GAIN = 0.2
-"""Views whose brightness goes less than this with the scan's are left out of a step."""
+FACING = 0.7  # least cosine of the normals of points that are matched
+LEAST_GAIN = 0.2  # views whose brightness goes less than this with the scan's are left out of a step
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,8 @@ from perception.geometry import nearest_rotation
 
 COUNT, KEPT, APART = 12_000, 64, 12.0
 """Rotations tried, which leave none farther than about 8° away; kept, at least APART degrees from one another."""
-SHARPNESS = 25.0
-"""Concentration of the kernel about each normal: a standard deviation of 8°."""
-TUKEY = 4.5
-"""Cut-off of Tukey's weights in medians of |r|, about three standard deviations."""
+SHARPNESS = 25.0  # concentration of the kernel about each normal: a standard deviation of 8°
+TUKEY = 4.5  # cut-off of Tukey's weights in medians of |r|, about three standard deviations
 _SIDE = 33
 
 

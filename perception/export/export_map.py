@@ -31,12 +31,10 @@ from perception.types import PointCloud
 if TYPE_CHECKING:
     from perception.export.depth_views import DepthView
 
-MOST_VIEWS, LONG_SIDE = 90, 320
-"""Views rendered for a registration, and their size in pixels."""
+MOST_VIEWS, LONG_SIDE = 90, 320  # views rendered for a registration, and their size in pixels
 
 SCANNET = Path("scannet")
-BESIDE = 0.1
-"""Distance in diagonals of a map up to which a scan beside its bounds may be of its outermost things."""
+BESIDE = 0.1  # distance in diagonals of a map up to which a scan beside its bounds may be of its outermost things
 
 
 @dataclass(frozen=True)
@@ -105,8 +103,7 @@ def read_transform(path: Path, gmap: Map) -> np.ndarray:
 
 
 SUFFIXES = (".ply", ".pcd", ".npz", ".spz")
-SURFACE_OPACITY = 0.5
-"""Gaussians of at least this opacity are the surface points of a map."""
+SURFACE_OPACITY = 0.5  # Gaussians of at least this opacity are the surface points of a map
 
 
 def side_file(output: Path) -> Path:

@@ -20,10 +20,8 @@ from perception.map.map import Map
 from perception.splats.spz import COLOR_SCALE, FLIPS, HEADER, MAGIC
 
 VERSION = 2
-FIRST_BITS, REST_BITS = 5, 4
-"""Bits that are kept of harmonics of degree 1, and of higher ones; fewer compress better."""
-FARTHEST = 1 << 22
-"""Largest coordinate: with no bits behind the point, of 24 with sign."""
+FIRST_BITS, REST_BITS = 5, 4  # bits that are kept of harmonics of degree 1, and of higher ones; fewer compress better
+FARTHEST = 1 << 22  # largest coordinate: with no bits behind the point, of 24 with sign
 
 
 def write_spz(path: Path, gmap: Map) -> None:

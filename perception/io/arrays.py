@@ -19,8 +19,7 @@ from perception.machine import require_memory
 
 MOST_ARCHIVE = 4 << 30
 """Maximum uncompressed size of an .npz in bytes, against damaged or hostile files that would fill the memory."""
-_DENSEST = 1032
-"""Most bytes that a byte of deflate's code can stand for."""
+_DENSEST = 1032  # most bytes that a byte of deflate's code can stand for
 _MOST_HEADER = 1 << 16
 _PIECE = 1 << 20  # bytes that are unpacked at a time
 _ONE_HEADER = Lock()

@@ -1,7 +1,6 @@
 """Reads and writes point clouds and meshes; the extension selects the format. Order and number of points are kept.
 
-PCD is the Point Cloud Library's format, version 0.7. pypcd4 1.5 is not used: it reads a file truncated at the end of a
-row as a smaller cloud, and allocates the size that a damaged header gives without a check.
+PCD is the Point Cloud Library's format, version 0.7; pypcd4 1.5 takes a truncated file for a smaller cloud.
 """
 
 from __future__ import annotations
@@ -28,16 +27,12 @@ _WRITTEN = {*"xyz", *_COLORS[0], *_NORMALS[0], *_NORMALS[1], "rgb"}
 """Names of columns that hold the points, colours and normals of files that are written."""
 _NPZ_OWN = {"points", "colors", "normals", "faces", "file", "allow_pickle"}
 """Names of the arrays of a cloud in an .npz, and what `np.savez` takes for options."""
-_EXACT = 2**53
-"""Whole numbers up to this are exact as doubles."""
-_ASIDE = 0.95
-"""Share of floating-point colours by whose largest their unit is seen: lights may exceed it."""
-_SOME = 1 << 16
-"""Points of which the unit of colours is seen, and faces that are split at a time."""
+_EXACT = 2**53  # whole numbers up to this are exact as doubles
+_ASIDE = 0.95  # share of floating-point colours by whose largest their unit is seen: lights may exceed it
+_SOME = 1 << 16  # points of which the unit of colours is seen, and faces that are split at a time
 _PCD_KINDS = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
 _PCD_COLUMNS, _PCD_LINE = 1 << 12, 1 << 14
-_LZF_DENSEST = 88
-"""Most bytes that a byte of LZF's code can stand for: 264 by 3."""
+_LZF_DENSEST = 88  # most bytes that a byte of LZF's code can stand for: 264 by 3
 
 
 def read_cloud(path: str | Path) -> PointCloud:
@@ -235,7 +230,7 @@ def _write_npz(path: Path, cloud: PointCloud) -> None:
 
 
 def _read_pcd(path: Path) -> PointCloud:
-    """The cloud of the fields of COUNT 1; rgb(a) is packed in 4 bytes. Fields named "_" are padding."""
+    """The cloud of the fields of COUNT 1; rgb(a) is packed in 4 bytes."""
     header = dict[str, list[str]]()
     with path.open("rb") as file:
         while "DATA" not in header:

@@ -19,10 +19,8 @@ from typing_extensions import NotRequired, TypedDict
 from perception.geometry import check_similarity, scale_of
 from perception.io.documents import brief, what_is_wrong
 
-LARGEST = 2**31 - 1
-"""Of ids and counts: they are int32 in arrays and clouds."""
-FARTHEST = 1e15
-"""Of numbers, so that products of a few stay finite."""
+LARGEST = 2**31 - 1  # of ids and counts: they are int32 in arrays and clouds
+FARTHEST = 1e15  # of numbers, so that products of a few stay finite
 
 
 def parsed(raw: bytes) -> Any:

@@ -1,7 +1,6 @@
-"""Reader and writer of PLY: elements of named properties, ASCII and both byte orders, lists of one or of many lengths.
+"""Reader and writer of PLY (Greg Turk 1994, with the 64-bit types of later writers): ASCII and both byte orders.
 
-Format: Greg Turk's "The PLY Polygon File Format" (1994), with the 64-bit types that later writers added. A table of
-which all rows have the same size is a structured array over the bytes of the file, so reading holds the file once.
+A table of which all rows have the same size is a structured array over the bytes of the file, which is held once.
 """
 
 from __future__ import annotations
@@ -46,8 +45,7 @@ _CODES = dict(zip(("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f2", "f4", "
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 _MAX_HEADER = 1 << 20
 MOST_ROWS = 1 << 40
-_PIECE = 1 << 15
-"""Rows of different sizes that are gathered at a time."""
+_PIECE = 1 << 15  # rows of different sizes that are gathered at a time
 _MSVC_NAN = re.compile(rb"-?1\.#[A-Z]+[0-9]*")
 """How programs of older Visual C++ write numbers that are not finite."""
 
@@ -126,8 +124,7 @@ def map_ply(path: str | Path, element: str) -> np.ndarray:
 
 
 def write_ply(path: str | Path, elements: Mapping[str, Mapping[str, np.ndarray]]) -> None:
-    """Write elements of scalar properties [rows] and list properties [rows, k], in the order given.
-    Binary little endian. The file appears complete or not at all."""
+    """Write elements of scalar properties [rows] and list properties [rows, k], in the order given, little endian."""
     with atomic_file(path) as new, new.open("wb") as file:
         file.write(_header(elements))
         for properties in elements.values():
@@ -329,10 +326,8 @@ def packed(properties: Mapping[str, np.ndarray]) -> np.ndarray:
     """The rows of a table as a structured array, little endian; each list after its length."""
     fields: list[tuple] = []
     for key, values in properties.items():
-        if values.ndim == 2:
-            fields += [(f"{key}\0count", "u1"), (key, "<" + _kind(values), (values.shape[1],))]
-        else:
-            fields.append((key, "<" + _kind(values)))
+        fields += [(f"{key}\0count", "u1")] if values.ndim == 2 else []
+        fields.append((key, "<" + _kind(values), values.shape[1:]))
     rows = np.empty(len(next(iter(properties.values()))), np.dtype(fields))
     for key, values in properties.items():
         rows[key] = values

@@ -19,10 +19,8 @@ from perception.io.documents import brief
 from perception.machine import cores
 from perception.progress import Progress
 
-CONNECT = 10.0
-"""Seconds in which a cluster must answer."""
-RETRIES = 5
-"""How often a task is run again whose worker was lost."""
+CONNECT = 10.0  # seconds in which a cluster must answer
+RETRIES = 5  # how often a task is run again whose worker was lost
 _CHILD = """import sys
 sys.path[:] = sys.argv[4:]
 from importlib import import_module

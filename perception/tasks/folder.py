@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import platform
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -68,8 +69,7 @@ def run_tasks(
     progress: Progress,
     each_core: bool = False,
 ) -> list[Path]:
-    """Runs the task in each folder, which leaves a folder RESULT there; returns those. See `Engine.run`.
-    InputError where a result is missing."""
+    """Runs the task in each folder (see `Engine.run`), which leaves a folder RESULT there; returns those."""
     engine.run(task, [str(folder.resolve()) for folder in folders], what, progress, each_core)
     for folder in folders:
         if not (folder / RESULT).is_dir():
@@ -83,8 +83,6 @@ def versions() -> dict[str, str]:
 
     found = {"perception": __version__, "python": platform.python_version(), "machine": platform.machine()}
     for name in ("torch", "numpy", "pycolmap", "hdbscan", "onnxruntime", "opencv-contrib-python-headless"):
-        try:
+        with suppress(metadata.PackageNotFoundError):
             found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
     return found
