@@ -256,10 +256,9 @@ def export_labels(
         segments = segment_cloud(cloud, scannet=options.segments is not None)
     else:
         segments = read_segments(options.segments, len(labels))
-    smoothed = vote(labels, segments)
-    if limit is not None:
-        smoothed[labels < 0] = -1  # points beyond the map stay unlabelled
-    return np.where(np.isfinite(cloud.points).all(axis=1), smoothed, -1).astype(np.int32)
+    inside = labels >= 0  # points beyond the map have no vote and stay unlabelled
+    labels[inside] = vote(labels[inside], segments[inside])
+    return labels
 
 
 def check_overlap(means: np.ndarray, points: np.ndarray) -> float:

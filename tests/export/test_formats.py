@@ -86,6 +86,15 @@ def test_a_scan_of_what_lies_outermost_is_of_the_map() -> None:
         check_overlap(means, outermost + np.array([0.3, 0, 0]))
 
 
+def test_a_floor_that_goes_on_beyond_the_map_is_labelled_within_it() -> None:
+    rng = np.random.default_rng(0)
+    floor, means = (np.insert(rng.uniform(0, side, (count, 2)), 2, 0, axis=1) for side, count in ((9, 9000), (3, 3000)))
+    labels = export_labels(means, np.ones(3000, np.int32), PointCloud(floor), ExportOptions(max_distance=0.2))
+    outside = np.maximum(floor[:, :2] - 3, 0)
+    assert (labels[(floor[:, :2] < 2.9).all(axis=1)] == 1).all()
+    assert (labels[np.linalg.norm(outside, axis=1) > 0.2] == -1).all()
+
+
 def test_one_point_and_duplicated_points_are_exported():
     means, ids = np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([3, 8], np.int32)
     assert export_labels(means, ids, PointCloud(np.array([[0.9, 0, 0]]))).tolist() == [8]
