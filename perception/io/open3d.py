@@ -11,9 +11,11 @@ import numpy as np
 
 from perception.errors import InputError, missing_extra
 from perception.io.atomic import atomic_file
+from perception.machine import require_memory
 
 Shot = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """camera_from_world [4, 4], K [3, 3], depth [H, W] (0 = none) and colors [H, W, 3] in [0, 1], float32."""
+_BLOCK_BYTES = 8**3 * (1 + 1 + 3) * 4  # of a block of voxels: distance, weight and colour of each
 
 
 def load_open3d() -> Any:
@@ -59,6 +61,8 @@ def fuse_depth(shots: Iterable[Shot], voxel: float) -> tuple[np.ndarray, np.ndar
         picture = o3d.t.geometry.Image(tensor(np.ascontiguousarray(colors)))
         far = (1.0, 2.0 * float(depth.max()), 4.0)  # unit, farthest depth, truncation
         blocks = grid.compute_unique_block_coordinates(image, *camera, *far)
+        held = _BLOCK_BYTES * (grid.hashmap().size() + len(blocks))  # copied where the table grows
+        require_memory(held, f"a surface with voxels of {voxel:g}", "choose a larger --voxel-size")
         grid.integrate(blocks, image, picture, camera[0], *camera, *far)
     mesh = grid.extract_triangle_mesh(1.5)
     if len(mesh.vertex.positions) == 0:

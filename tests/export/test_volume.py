@@ -149,6 +149,14 @@ def test_glb_holds_the_mesh(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["m.glb"]
 
 
+def test_a_surface_that_memory_does_not_hold_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("open3d")
+    shots = [(view.camera_from_world, view.K, view.depth, view.colors) for view in ball_views(1, 40)]
+    monkeypatch.setattr("perception.machine.available_memory", lambda: 2.0**20)
+    with pytest.raises(InputError, match=r"surface with voxels of 0\.01: needs about .* choose a larger --voxel-size"):
+        fuse_depth(shots, 0.01)
+
+
 def test_bodies_and_voxels_that_memory_does_not_hold_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("perception.machine.available_memory", lambda: 2.0**28)
     with pytest.raises(InputError, match="choose larger voxels"):
