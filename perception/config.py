@@ -37,31 +37,27 @@ class Settings(BaseModel):
         return value
 
 
-def absolute_paths(value: str, folder: Path = Path()) -> str:
-    """A setting that names files, as PATH, KIND:PATH or KIND:PATH,PATH: what exists as absolute paths, so that it means
-    the same files in another folder; all else, such as the name of a stored model, as it is. folder: that to which
-    paths are relative.
-
-    >>> absolute_paths("sam:mobilesam")
-    'sam:mobilesam'
-    """
-    kind, colon, named = value.partition(":") if value.startswith(("labels:", "sam:", "clip:")) else ("", "", value)
-
-    def found(part: str) -> str | None:
-        path = folder / part  # Path.exists raises for a name that is too long
-        return str(path.absolute()) if part and os.path.exists(path) else None  # noqa: PTH110
-
-    return kind + colon + (found(named) or ",".join(found(part.strip()) or part for part in named.split(",")))
+KINDS = ("labels:", "sam:", "clip:")
 
 
-def _path_settings(*names: str) -> Any:
-    """A validator of settings that name files, relative to the `folder` of `settings_from`. Words such as "auto" name
-    none where a KIND is expected before a path."""
+def _paths(*names: str) -> Any:
+    """A validator of settings that name files, as PATH, or for masks and encoders as KIND:PATH,PATH: paths are made
+    absolute, to mean the same files in another folder. What is not there, as the name of a stored model, stays; but
+    models aside, all paths lie in the `folder` of `settings_from` if there is one."""
 
     def absolute(value: str | None, info: ValidationInfo) -> str | None:
-        if value is None or (info.field_name in ("masks", "encoder") and ":" not in value):
+        spec, folder = info.field_name in ("masks", "encoder"), (info.context or {}).get("folder")
+        if value is None or (spec and not value.startswith(KINDS)):  # a word such as "auto"
             return value
-        return absolute_paths(value, (info.context or {}).get("folder", Path()))
+        kind, colon, named = value.partition(":") if spec else ("", "", value)
+        models = kind in ("sam", "clip")
+
+        def found(part: str) -> str | None:
+            path = (folder or Path()) / part  # Path.exists raises for a name that is too long
+            there = (folder and not models) or (part and os.path.exists(path))  # noqa: PTH110
+            return str(path.absolute()) if there else None
+
+        return kind + colon + (found(named) or ",".join(found(part.strip()) or part for part in named.split(",")))
 
     return field_validator(*names)(absolute)
 
@@ -85,7 +81,7 @@ class PhotoConfig(Settings):
         "auto", description="given poses: refined where matched features show that they are wrong, kept, or refined"
     )
     strict: bool = Field(False, description="refuse a damaged photo instead of leaving it out")
-    _absolute = _path_settings("held_out", "camera", "ignore_masks", "init_points")
+    _absolute = _paths("held_out", "camera", "ignore_masks", "init_points")
     memory: str | None = Field(
         None,
         pattern=r"^[1-9][0-9]*[MG]$",
@@ -108,7 +104,7 @@ class SplatConfig(Settings):
     cameras: str | None = Field(None, description="of a finished splat: COLMAP model or transforms.json, used first")
     up: str | None = Field(None, description="of a finished splat: z, -y, ... or X,Y,Z; none: as its floor lies")
     unit: str | None = Field(None, pattern="^metre$", title="metre", description="of a finished splat, if known")
-    _absolute = _path_settings("cameras")
+    _absolute = _paths("cameras")
 
 
 class SamConfig(Settings):
@@ -186,7 +182,7 @@ class LanguageConfig(Settings):
     texts: Literal["auto", "on", "off"] = Field(
         "auto", description="reading of printed texts; auto: if the extra ocr is installed"
     )
-    _absolute = _path_settings("encoder")
+    _absolute = _paths("encoder")
 
 
 class MapConfig(Settings):
@@ -209,7 +205,7 @@ class MapConfig(Settings):
     losses: LossConfig = LossConfig()
     instances: InstanceConfig = InstanceConfig()
     language: LanguageConfig = LanguageConfig()
-    _absolute = _path_settings("masks")
+    _absolute = _paths("masks")
 
     def part(self, share: float) -> MapConfig:
         """The settings of one of several trainings of a run, which has `share` of the time limit if there is one."""
@@ -272,10 +268,10 @@ def load_config(
     pairs: list[str] | None = None,
     preset: str = "default",
     given: Mapping[str, tuple[Any, str]] | None = None,
-    folder: Path = Path(),
+    folder: Path | None = None,
 ) -> MapConfig:
     """Defaults, overridden by the preset, `given` settings (see `settings_from`), the TOML file and KEY=VALUE pairs.
-    folder: that to which paths in settings are relative. Raises InputError for the first error.
+    folder: that to which paths in settings are relative, None for the current one. InputError for the first error.
 
     >>> config = load_config(pairs=["train.iterations=500", "masks=labels:labels"], preset="fast")
     >>> config.train.iterations, config.train.effort, config.masks
@@ -290,9 +286,10 @@ def load_config(
     return settings_from(MapConfig, given, folder)
 
 
-def settings_from(model: type[AnySettings], given: Mapping[str, tuple[Any, str]], folder: Path = Path()) -> AnySettings:
-    """The model with the given settings: dotted key -> (value, where it was read, for the error message). folder: that
-    to which their paths are relative.
+def settings_from(
+    model: type[AnySettings], given: Mapping[str, tuple[Any, str]], folder: Path | None = None
+) -> AnySettings:
+    """The model with the given settings: dotted key -> (value, where it was read). folder: as of `load_config`.
 
     Raises InputError with key, value and range for the first setting that is unknown, of another type or out of range.
     """
@@ -334,17 +331,6 @@ def expected(field: FieldInfo) -> str:
         for name, relation in (("gt", "above"), ("ge", "from"), ("le", "to")):
             text += "".join(f" {relation} {getattr(m, name)}" for m in field.metadata if hasattr(m, name))
     return f"{text} or none" if NoneType in kinds else text
-
-
-def settings_text() -> str:
-    """All settings with default, range and effect, user settings first, for `--help`."""
-    lines: dict[bool, list[str]] = {False: [], True: []}
-    for key, field in fields(MapConfig):
-        default = "none" if field.default is None else field.default
-        default = str(default).lower() if isinstance(default, bool) else default
-        lines[key.startswith(METHOD)] += [f"  {key}={default}  ({expected(field)})", f"      {field.description}"]
-    head = "settings, for --set KEY=VALUE and --config FILE.toml:"
-    return "\n".join([head, *lines[False], "settings that vary the method, for experiments:", *lines[True]])
 
 
 def read_pairs(pairs: list[str]) -> dict[str, Any]:

@@ -94,9 +94,16 @@ def _add_engine(p: argparse.ArgumentParser, what: str) -> None:
 
 
 def _settings() -> str:
-    from perception.config import settings_text
+    """All settings with default, range and effect, user settings first, for `--help`."""
+    from perception.config import METHOD, MapConfig, expected, fields
 
-    return settings_text()
+    lines: dict[bool, list[str]] = {False: [], True: []}
+    for key, field in fields(MapConfig):
+        default = field.default
+        default = "none" if default is None else str(default).lower() if isinstance(default, bool) else default
+        lines[key.startswith(METHOD)] += [f"  {key}={default}  ({expected(field)})", f"      {field.description}"]
+    head = "settings, for --set KEY=VALUE and --config FILE.toml:"
+    return "\n".join([head, *lines[False], "settings that vary the method, for experiments:", *lines[True]])
 
 
 _SHORTCUTS = {

@@ -194,6 +194,9 @@ def test_paths_in_settings_are_relative_to_the_list(tmp_path: Path, monkeypatch:
         assert [Path(str(text).rpartition(":")[2]).resolve() for text in found] == [
             tmp_path / "lists" / name for name in ("labels", "model", "camera.yaml")
         ]
+    shutil.rmtree(tmp_path / "lists/labels")
+    settings = MapConfig.model_validate(read_jobs(tmp_path / "lists/jobs.yaml")[0]["settings"])
+    assert settings.masks == f"labels:{tmp_path}/lists/labels"  # not those of here
 
 
 def test_an_address_without_ray_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
