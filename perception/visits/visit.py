@@ -138,9 +138,9 @@ def open_visit(run: Run, gmap: Map, source: MaskSource, output: Path) -> Visit:
         scene = visit_scene(run, gmap, output)
         refuse_older(gmap, scene.views)
     left_out = _told(run, scene.report.get("left_out", []))
-    for note in scene.report.get("notes", []):
-        run.progress.log(note)
     scene, training, held_out = split_scene(scene, run.config.photos)
+    for line in [*scene.report.get("notes", []), *map("warning: {}".format, scene.report.get("warnings", []))]:
+        run.progress.log(line)
     photos = Photos.load(run, training, held_out)
     if scene.report.get("input") != "photos":
         with run.stage("poses"):
