@@ -14,6 +14,7 @@ from perception.frame.recentre import map_from_input, moved
 from perception.frame.scale import KnownLength, Measurement, combined, known_length
 from perception.frame.world_frame import measured_scale
 from perception.geometry import move_points
+from perception.map.history import is_removed
 from perception.map.map import Map
 from perception.map.replace import writing
 from perception.map.write import read_map, write_map
@@ -127,7 +128,7 @@ def _between(gmap: Map, length: KnownLength) -> Measurement:
 
 
 def _instance(gmap: Map, name: str) -> dict[str, Any]:
-    alike = [e for e in gmap.instances if name in (str(e["id"]), e.get("label"))]
+    alike = [e for e in gmap.instances if name in (str(e["id"]), e.get("label")) and not is_removed(e)]
     if len(alike) != 1:
-        raise InputError(f"known length: {len(alike)} instances are called '{name}'; expected one label or id")
+        raise InputError(f"known length: {len(alike)} instances are called '{name}' today; expected one label or id")
     return alike[0]

@@ -14,9 +14,10 @@ from perception.edit.scale import scaled
 from perception.frame.recentre import map_from_input
 from perception.gaussians.model import as_gaussians
 from perception.gaussians.views import render
-from perception.map.write import Map, read_map, write_map
+from perception.map.write import Map, read_map, set_labels, write_map
 from perception.report.text import depth_text
 from support.viewer_maps import small_map
+from support.visited_map import number, write_visited_map
 
 
 def some_map() -> Map:
@@ -93,6 +94,16 @@ def test_scale_by_two_instances_and_by_two_points(tmp_path: Path, capsys: pytest
     assert "scale: a unit is 1 m ± 0.0" in capsys.readouterr().out
     assert main(["scale", str(path), "--known-length", "2: 0,0,0 0,0,4"]) == 0  # in place
     assert read_map(path).means[0] == pytest.approx(old.means[0] / 2, rel=1e-5)
+
+
+def test_a_name_means_the_thing_that_stands_today(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The mug is gone; the drum in cell 5 has its name now, the violin stands in cell 4."""
+    path = write_visited_map(tmp_path / "m.gsmap")
+    set_labels(path, {number("mug"): "cup", number("drum"): "cup"})
+    assert main(["scale", str(path), "--known-length", f"5: cup, {number('violin')}", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["factor"] == pytest.approx(5, rel=0.02)  # they are 1 apart
+    assert main(["scale", str(path), "--known-length", f"5: {number('mug')}, cup"]) == 2
+    assert "0 instances are called '10' today" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
