@@ -18,6 +18,8 @@ _NAMES = dict.fromkeys(("plumb_bob", "rational_polynomial", "radtan", "brown_con
 _NAMES |= dict.fromkeys(("equidistant", "fisheye", "kannala_brandt4"), FISHEYE)
 _NAMES |= dict.fromkeys(("none", "inverse_brown_conrady", "modified_brown_conrady"), ())
 """The coefficients of distortion models of ROS, Kalibr and librealsense that may differ from zero."""
+_SKEW = 1e-3
+"""Largest number relative to fx where a camera matrix without skew has 0; matrices by columns have cx there."""
 _COUNTS = (0, 4, 5, 8, 12, 14)
 """Numbers of coefficients that OpenCV reads; a driver may write zeros behind those of its model."""
 
@@ -39,6 +41,9 @@ def lens_of(data: Any, where: object) -> Lens:
     if min(width, height) < 1 or max(width, height) > MOST_SIDE or min(fx, fy) <= 0:
         sides = f"{width:.6g}×{height:.6g}, {fx:g}, {fy:g}"
         raise InputError(f"{where}: image sides must be 1 to {MOST_SIDE} pixels, focal lengths positive; found {sides}")
+    if np.abs(matrix[[0, 1, 2, 2], [1, 0, 0, 1]]).max() > _SKEW * fx:
+        row = " ".join(f"{value:g}" for value in matrix.ravel())
+        raise InputError(f"{where}: camera_matrix must be fx 0 cx 0 fy cy 0 0 1, row by row, found {row}")
     name = data.get("distortion_model") or "plumb_bob"
     names = _NAMES.get(name.lower().replace(" ", "_")) if isinstance(name, str) else None
     if names is None:

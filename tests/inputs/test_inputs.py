@@ -246,6 +246,13 @@ def test_a_camera_file_without_distortion_says_that_it_is_missing(tmp_path):
         read_camera(tmp_path / "camera.yaml")
 
 
+@pytest.mark.parametrize("data", ["90, 0, 0, 0, 91, 0, 48.5, 40.5, 1", "90, 3, 48.5, 0, 91, 40.5, 0, 0, 1"])
+def test_a_camera_matrix_by_columns_or_with_skew_is_refused(data, tmp_path):
+    (tmp_path / "camera.yaml").write_text(CAMERA.replace("90, 0, 48.5, 0, 91, 40.5, 0, 0, 1", data))
+    with pytest.raises(InputError, match=f"row by row, found {data.replace(',', '')}"):
+        read_camera(tmp_path / "camera.yaml")
+
+
 def test_exif_grey_sixteen_bit_and_alpha(tmp_path):
     exif = Image.Exif()
     exif[0x0112] = 6
