@@ -117,7 +117,7 @@ def _storage(path: Path) -> list[Path]:
     InputError for a folder without a bag, or with several, and for SQLite's files that miss what is in their log."""
     if not path.is_dir():
         return [path]
-    files = sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))
+    files = [file for file in sorted(path.iterdir()) if file.suffix in (".mcap", ".db3") and file.name[0] != "."]
     for log in (file.with_name(file.name + _WAL) for file in files):
         if log.is_file() and log.stat().st_size:
             found = f"{log}: holds messages that are not in the database yet"

@@ -378,6 +378,7 @@ def test_a_message_cut_in_the_bag_and_a_pose_that_is_not_finite(kind: str, tmp_p
 def test_a_folder_whose_recorder_was_killed(kind: str, described: bool, tmp_path: Path) -> None:
     record(tmp_path / "a", kind)
     (tmp_path / "a" / "metadata.yaml").unlink()
+    (tmp_path / "a" / "._a_0.mcap").write_bytes(b"\0")  # as macOS leaves beside files
     if described:
         (tmp_path / "a" / "metadata.yaml").write_text("")
     facts, _ = run_frames(tmp_path / "a", tmp_path / "out", ALL)
