@@ -75,7 +75,7 @@ def info_text(path: Path, info: dict[str, Any], entries: Sequence[dict[str, Any]
         lines.append("of training: " + ", ".join(f"{name} {share:.0%}" for name, share in shares(training).items()))
     if depth := info.get("depth"):
         lines.append(f"depth images: {depth['views']}, measured in {depth['measured']:.0%} of their pixels")
-    if printed := [e for e in entries if e.get("texts")]:
+    if printed := [e for e in entries if e.get("texts") and not is_removed(e)]:
         from perception.query.hit import printed_texts
 
         lines += [f"printed on {e['id']}: {visible(', '.join(printed_texts(e)))}" for e in printed]

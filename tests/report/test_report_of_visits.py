@@ -13,6 +13,7 @@ from perception.map.write import Map, read_map, write_map
 from perception.photos.view_json import StoredView, stored_view
 from perception.query import QueryMap
 from perception.report import page
+from perception.report.page import write_page
 from perception.types import View
 from support.query_maps import encoders
 from support.visited_map import number, write_visited_map
@@ -82,3 +83,12 @@ def test_of_two_held_out_photos_one_is_the_worst_and_one_the_best(tmp_path: Path
     rows = page._view_rows(page._Album(Map.of(read_map(path), views=views, info=info)))
     captions = [next(caption for caption in row if caption.startswith("render")) for row in rows]
     assert captions == ["render: 20.00 dB, SSIM 0.500, worst of 2", "render: 21.00 dB, SSIM 0.500, best of 2"]
+
+
+@pytest.mark.parametrize("rows", [0, 3])
+def test_changes_are_a_table_where_there_are_some(data: dict[str, Any], rows: int, tmp_path: Path) -> None:
+    changes = {**data["changes"], "rows": data["changes"]["rows"][:rows]}
+    write_page(tmp_path / "page.html", {**data, "changes": changes})
+    told = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert changes["title"] in told
+    assert told.count('<td class="spot">') == 2 * rows and ("<th>before</th>" in told) == (rows > 0)

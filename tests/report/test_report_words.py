@@ -77,6 +77,14 @@ def test_the_next_command_can_be_copied_for_any_name(name: str) -> None:
     assert (args.command, args.map, args.text) == ("query", Path(name), ["mug"])
 
 
+def test_what_is_printed_is_told_of_things_that_are_there() -> None:
+    info = {"num_gaussians": 9, "num_instances": 2, "sh_degree": 1, "metric": True, "views": []}
+    entries = [{"id": n, "texts": [{"text": f"NO {n}", "score": 0.9}]} for n in (3, 4)]
+    entries[1]["state"] = "removed"
+    lines = info_text(Path("k.gsmap"), info, entries).splitlines()
+    assert [line for line in lines if line.startswith("printed")] == ['printed on 3: "NO 3"']
+
+
 def test_who_has_no_encoder_is_told_to_name_things() -> None:
     info = {"num_gaussians": 9, "num_instances": 6, "sh_degree": 1, "metric": True, "views": []}
     line = info_text(Path("k.gsmap"), {**info, "instances": {"encoder": None}}).splitlines()[2]
