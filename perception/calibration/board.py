@@ -122,8 +122,11 @@ class Board:
     def __post_init__(self) -> None:
         if self.kind not in ("charuco", "checkerboard"):
             raise InputError(f"--board is '{self.kind}'; expected charuco or checkerboard")
-        if min(self.squares) < 3 or not self.square > 0:
-            raise InputError(f"board of {self.squares[0]}x{self.squares[1]} squares of {self.square}: too small")
+        least = 4 if self.kind == "checkerboard" else 3  # OpenCV finds no fewer
+        corners = (self.squares[0] - 1) * (self.squares[1] - 1)
+        if min(self.squares) < least or corners < MIN_CORNERS or not 1e-9 < self.square < 1e9:
+            what = f"board of {self.squares[0]}x{self.squares[1]} squares of {self.square}: too small or too large"
+            raise InputError(f"{what}; expected {least}x{least} or more with {MIN_CORNERS} corners between them")
         if self.kind == "checkerboard":
             return
         if not 0 < self.marker < self.square:

@@ -229,6 +229,17 @@ def test_a_board_of_more_markers_than_its_dictionary_has() -> None:
         Board.from_text("charuco:10x10:0.03:0.022:4X4_50:0.5")
 
 
+@pytest.mark.parametrize(
+    "text", ["checkerboard:3x9:0.02", "charuco:3x4:0.02", "charuco:8x11:inf", "charuco:8x11:1e300"]
+)
+def test_a_board_that_is_never_found_is_refused(text: str) -> None:
+    """OpenCV refuses checkerboards of 2 corners a row, and numbers beyond float32; 6 corners are too few here."""
+    with pytest.raises(InputError, match="too small or too large; expected"):
+        Board.from_text(text)
+    for smallest in ("checkerboard:4x4:0.02", "charuco:3x5:0.02"):
+        assert Board.from_text(smallest).detect("grey", np.full((120, 160), 128, np.uint8)) is None
+
+
 def test_photos_of_one_name_in_two_folders_are_told_apart(tmp_path) -> None:
     """Their names are the keys of the report's views."""
     for name in ("a", "b"):
