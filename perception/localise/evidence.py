@@ -45,8 +45,9 @@ def _expected(reference: Reference, pose: Pose) -> np.ndarray:
     x = reference.points[np.unique(point[alike])] @ rotation.T + shift
     x, camera = x[x[:, 2] > 0], camera_from_lens(pose.lens)
     pixel = np.asarray(camera.img_from_cam(x), np.float64).reshape(-1, 2)
+    inside = ((pixel >= 0) & (pixel < (pose.lens.width, pose.lens.height))).all(axis=1)
+    pixel, rays = pixel[inside], x[inside, :2] / x[inside, 2:]
     back = np.asarray(camera.cam_from_img(pixel), np.float64).reshape(-1, 2)
-    rays = x[:, :2] / x[:, 2:]
     # A polynomial of distortion leads rays from far outside the picture into it: those do not come back.
     return pixel[np.linalg.norm(back - rays, axis=1) < SAME_RAY * (1 + np.linalg.norm(rays, axis=1))]
 
