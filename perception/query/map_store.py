@@ -171,7 +171,7 @@ class MapStore:
             for own, boxes, names in zip(self._maps.slices, self._maps.boxes, self._maps.names, strict=True)
             if boxes and all(tidy(label or "") != tidy(text) for label in names["labels"])
         ]
-        thing = self.ranker.scores(relation.thing, *gains_of(self.ranker, maps, relation))
+        thing = self.ranker.scores(relation.thing, gains_of(self.ranker, maps, relation))
         for own, _ in maps:
             scores[own] = thing[own]
         return scores

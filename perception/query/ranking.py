@@ -68,6 +68,7 @@ THICK_WEIGHT = 1.0  # the same where it is too thick
 STUFF_WEIGHT = 2.0  # subtracted from z of a floor, wall or ceiling for a household thing
 LABEL_MARGIN = 2.0  # subtracted from z of a label, where z is the similarity of label and prompt relative to the probes
 LEAST_SPREAD = 1e-3  # of σ_tk, so that no text divides by zero
+NO_GAINS = np.zeros((2, 1))
 
 T = TypeVar("T")
 _quantiles = np.vectorize(NormalDist().inv_cdf, otypes=[float])
@@ -216,26 +217,26 @@ class Scorer:
         """Scores [I, K] of `shape_words.KINDS`; None if shapes are not available."""
         return None if self._measure_shapes is None else self._measure_shapes()
 
-    def rank(self, prompt: str, gain: np.ndarray | float = 0.0, lack: np.ndarray | float = 0.0) -> Answer:
-        """Scores every instance for one prompt; see the module docstring. gain, lack: of `scores`."""
-        scores = self.scores(prompt, gain, lack)
+    def rank(self, prompt: str, gains: np.ndarray = NO_GAINS) -> Answer:
+        """Scores every instance for one prompt; see the module docstring. gains: of `scores`."""
+        scores = self.scores(prompt, gains)
         hits = [(int(i), float(scores[i])) for i in np.argsort(-scores, kind="stable")]
         return Answer(check_texts([prompt])[0], hits, bool(answering(hits)))
 
-    def scores(self, prompt: str, gain: np.ndarray | float = 0.0, lack: np.ndarray | float = 0.0) -> np.ndarray:
-        """Scores [I] in [0, 1] of all instances for one prompt. gain: [I], added to z; lack: [I], how much less it is
-        than that of the best one of the map, subtracted from the evidence of labels."""
+    def scores(self, prompt: str, gains: np.ndarray = NO_GAINS) -> np.ndarray:
+        """Scores [I] in [0, 1] of all instances for one prompt. gains [2, I]: what is added to z; how much less that is
+        than the most in the map, which is subtracted from the evidence of labels."""
         text = check_texts([prompt])[0]
         if not len(self.seen):
             return np.zeros(0)
         quoted = quoted_text(text) if self._printed is not None else None
         if quoted is None:
-            return self._scores(text, None, gain, lack)
-        scores = self._scores(*quoted, gain, lack)
+            return self._scores(text, None, gains)
+        scores = self._scores(*quoted, gains)
         scores[self._named[[name == tidy(text) for name in self._names]]] = 1.0
         if self._reads is None or self._reads.all():
             return scores
-        return np.where(self._reads, scores, self._scores(text, None, gain, lack))
+        return np.where(self._reads, scores, self._scores(text, None, gains))
 
     def similarity(self, texts: Sequence[str]) -> np.ndarray:
         """Cosine of each text's embedding with each instance's [T, I] in [−1, 1], as in the paper; −1 if unseen."""
@@ -245,9 +246,9 @@ class Scorer:
         """Relevancy x of each text for each instance [T, I], without the bonuses and labels."""
         return self.encoder.relevancy(self.encoder.embed(texts), self.prepared.compared)
 
-    def _scores(self, text: str, quoted: str | None, gain: np.ndarray | float, lack: np.ndarray | float) -> np.ndarray:
-        """Scores [I] for a prompt; quoted: what must be printed on the instance; gain, lack: of `scores`."""
-        reading, known = self.encoder.reading, self.prepared
+    def _scores(self, text: str, quoted: str | None, gains: np.ndarray) -> np.ndarray:
+        """Scores [I] for a prompt; quoted: what must be printed on the instance; gains: of `scores`."""
+        reading, known, (gain, lack) = self.encoder.reading, self.prepared, gains
         colors = color_words(text.partition(" with ")[0] if reading.colors else text)  # "duck with red hat" is not red
         asked = text if reading.colors else without_color_words(text)
         row, (middle, spread) = self.encoder.embed([asked]), known.null.T

@@ -81,18 +81,16 @@ def ranked(ranker: Scorer, boxes: LevelBoxes | None, text: str) -> Answer:
     if relation is None or boxes is None or quoted_text(text) is not None:
         return ranker.rank(text)
     gains = gains_of(ranker, [(slice(None), boxes)], relation)
-    return replace(ranker.rank(relation.thing, *gains), text=" ".join(text.split()))
+    return replace(ranker.rank(relation.thing, gains), text=" ".join(text.split()))
 
 
-def gains_of(
-    ranker: Scorer, maps: Sequence[tuple[slice, LevelBoxes]], relation: Relation
-) -> tuple[np.ndarray, np.ndarray]:
-    """[I] each: WEIGHT · f, and how much less that is than the most of the own map. maps: as of `fulfilled`."""
+def gains_of(ranker: Scorer, maps: Sequence[tuple[slice, LevelBoxes]], relation: Relation) -> np.ndarray:
+    """[2, I]: WEIGHT · f, and how much less that is than the most of the own map. maps: as of `fulfilled`."""
     gain = WEIGHT * fulfilled(ranker, maps, relation)
     most = gain.copy()
     for own, _ in maps:
         most[own] = gain[own].max(initial=0.0)
-    return gain, most - gain
+    return np.stack([gain, most - gain])
 
 
 def fulfilled(
