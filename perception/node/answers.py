@@ -57,8 +57,7 @@ LOCALISE_ANSWER = Channel("localise/answer", "std_msgs/msg/String")
 
 OUTPUTS = (ANSWER, POINTS, BOXES, MARKS, MAP_CLOUD, CHANGES, HEALTH, LOCALISE_POSE, LOCALISE_ANSWER)
 
-DEPTH = 64
-"""Largest number of messages queued for a slow reader; older ones are dropped, which bounds the memory."""
+DEPTH = 64  # largest number of messages queued for a slow reader; older ones are dropped, which bounds the memory
 
 Stamp = tuple[int, int]
 _FIELD_KINDS = {"<i4": 5, "<u4": 6, "<f4": 7}  # sensor_msgs/PointField

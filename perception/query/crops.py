@@ -17,8 +17,7 @@ from perception.photos.view_json import StoredView, absolute, locate_photo
 from perception.query.query_map import QueryMap
 from perception.types import View
 
-MARGIN = 0.15
-"""Margin around the bounding box, as a share of its longer side."""
+MARGIN = 0.15  # margin around the bounding box, as a share of its longer side
 OUTSIDE = "photos outside the map's folder are not shown; --photos DIR shows those in DIR"
 """What a server answers for a map that names such photos."""
 

@@ -129,7 +129,6 @@ def _indexed(store: Path, gmap: QueryMap, facts: dict[str, Any]) -> dict[str, An
 
 
 def _arrays(gmap: QueryMap) -> dict[str, np.ndarray]:
-    """The arrays of a map's file."""
     ranker, boxes, count = gmap.ranker, LevelBoxes.of(gmap), len(gmap.instances)
     prepared, things, records = ranker.prepared, np.zeros(count, THING), np.zeros(count, RECORD)
     for name in ("seen", "null", "colors", "sides"):

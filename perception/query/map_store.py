@@ -38,8 +38,7 @@ from perception.query.text_ranking import REMEMBERED, Encoders
 from perception.query.where import Frame, Where, tidy
 from perception.types import OrientedBox
 
-FORMAT_VERSION = 2
-"""Of the store, and of what ranking prepares: other numbers there need another version here."""
+FORMAT_VERSION = 2  # of the store, and of what ranking prepares: other numbers there need another version here
 _COLORS, _SHAPES = ("colors", "f8", len(COLOR_WORDS)), ("shapes", "f8", len(KINDS))
 THING = np.dtype([("seen", "?"), ("null", "f8", 2), _COLORS, ("sides", "f8", 3), _SHAPES])
 """Of `ranking.Prepared`, and the scores of `shape_words.KINDS`; NaN where not known."""

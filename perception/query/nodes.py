@@ -41,8 +41,7 @@ class Node:
         return replace(hit, instance_id=self.instances[0], part=part, instances=() if self.is_part else self.instances)
 
 
-Candidate = tuple[int | Node, float]
-"""A row of instances.json, or a node, and its score."""
+Candidate = tuple[int | Node, float]  # a row of instances.json, or a node, and its score
 
 
 class Nodes:

@@ -11,8 +11,7 @@ from perception.language.description import chosen_rows
 from perception.map.history import RECORD, is_removed
 from perception.map.map import Map, build_index, language_in, prefixed
 
-Spot = dict[str, Any]
-"""An entry of instances.json, or one of its `past`."""
+Spot = dict[str, Any]  # an entry of instances.json, or one of its `past`
 _THEN = ("centroid", "obb", "aabb")
 _NOT_THEN = {*_THEN, "parts", *(key.rstrip("?") for key in RECORD)}
 """Keys of an entry that are not those of an earlier spot."""

@@ -23,8 +23,7 @@ from perception.query.where import tidy
 
 Encoders = Callable[[str], Encoder | None]
 SAMPLES, TRIM = 1000, 0.05  # points per instance, and share of them left out, when its sides are measured
-REMEMBERED = 256
-"""Number of prompts whose ranking is cached, because planners repeat the same prompts."""
+REMEMBERED = 256  # number of prompts whose ranking is cached, because planners repeat the same prompts
 
 
 class TextRanking:

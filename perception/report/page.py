@@ -37,10 +37,8 @@ from perception.query.hit import printed_texts
 from perception.report.text import changes_parts, depth_figures, names_of
 from perception.types import OrientedBox
 
-SHOWN = ("worst", "middle", "best")
-"""Held-out views shown beside their photos, by PSNR."""
-LIMIT = 3_000_000
-"""Maximum size of the page in bytes."""
+SHOWN = ("worst", "middle", "best")  # held-out views shown beside their photos, by PSNR
+LIMIT = 3_000_000  # maximum size of the page in bytes
 SIZES = ((460, 82), (360, 74), (260, 66), (180, 55), (120, 45))
 """(longest side, quality) of the images, tried in this order."""
 

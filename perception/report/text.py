@@ -37,10 +37,8 @@ def shares(training: dict[str, Any]) -> dict[str, float]:
     return {name: round(seconds / total, 4) for name, seconds in sorted(parts.items(), key=lambda part: -part[1])}
 
 
-CHANGED = STATES[:3]
-"""The states of things that are not as they were."""
-SHARP, BLURRED = 25.0, 20.0
-"""Held-out PSNR in dB from which a map is called sharp, and below which poor."""
+CHANGED = STATES[:3]  # the states of things that are not as they were
+SHARP, BLURRED = 25.0, 20.0  # held-out PSNR in dB from which a map is called sharp, and below which poor
 
 
 def info_text(path: Path, info: dict[str, Any], entries: Sequence[dict[str, Any]] = ()) -> str:

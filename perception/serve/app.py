@@ -23,8 +23,7 @@ from perception.serve.guard import HANDLERS, OPEN, HttpGuard
 from perception.serve.localise import LocaliseBody
 from perception.serve.requests import ServeSettings, source
 
-FORMATS = {"npz": "application/x-npz", "ply": "application/octet-stream"}
-"""Name → media type."""
+FORMATS = {"npz": "application/x-npz", "ply": "application/octet-stream"}  # name → media type
 
 
 def encode(gmap: QueryMap, instance_id: int, kind: str) -> bytes:
@@ -109,8 +108,6 @@ class MapQueries:
 
 
 def add_localising(app: FastAPI, queries: MapQueries, settings: ServeSettings) -> None:
-    """The route that tells where a picture was taken."""
-
     @app.post("/localise")
     async def localise(body: LocaliseBody, map_id: MapId = None) -> Response:
         """The pose of a picture's camera, with its standard error; or why it is not in this map."""
@@ -123,8 +120,6 @@ def add_localising(app: FastAPI, queries: MapQueries, settings: ServeSettings) -
 
 
 def add_state(app: FastAPI, engine: QueryEngine) -> None:
-    """The routes of the server's state."""
-
     @app.get("/health")
     async def health(request: Request) -> Response:
         """The state of the server; without the token its status only."""
@@ -140,8 +135,6 @@ def add_state(app: FastAPI, engine: QueryEngine) -> None:
 
 
 def add_searches(app: FastAPI, queries: MapQueries) -> None:
-    """The routes that search for instances."""
-
     @app.post("/query")
     async def query(body: QueryBody, map_id: MapId = None) -> Response:
         """The instances that answer each text, ranked."""
@@ -180,8 +173,6 @@ def add_searches(app: FastAPI, queries: MapQueries) -> None:
 
 
 def add_instances(app: FastAPI, queries: MapQueries) -> None:
-    """The routes of the map's instances."""
-
     @app.get("/instances")
     async def instances(map_id: MapId = None, at: At = None) -> Response:
         """All instances."""

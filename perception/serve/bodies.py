@@ -18,8 +18,7 @@ from perception.query.where import Frame, Where, axis_box
 from perception.serve.requests import MAX_TEXTS, Request
 from perception.types import OrientedBox
 
-MAX_NUMBER = 1e12
-"""Largest absolute value of a number; it exceeds every coordinate on the earth in millimetres."""
+MAX_NUMBER = 1e12  # largest absolute value of a number; it exceeds every coordinate on the earth in millimetres
 
 Number = Annotated[float, Field(ge=-MAX_NUMBER, le=MAX_NUMBER)]
 Length = Annotated[float, Field(ge=0, le=MAX_NUMBER)]

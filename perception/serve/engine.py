@@ -40,10 +40,8 @@ from perception.serve.requests import (
 
 T = TypeVar("T")
 _log = logging.getLogger("perception.query")
-_SELDOM = 32
-"""Largest interval between attempts to open an unreadable new map, in multiples of `watch`."""
-_REMEMBERED = 1000
-"""Number of latencies kept for `health`."""
+_SELDOM = 32  # largest interval between attempts to open an unreadable new map, in multiples of `watch`
+_REMEMBERED = 1000  # number of latencies kept for `health`
 
 
 class QueryEngine:

@@ -26,7 +26,6 @@ _STATUS |= dict.fromkeys(("unknown_frame", "no_scale", "bad_input"), 400)
 
 
 def problem(status: int, line: str, headers: Mapping[str, str] | None = None) -> JSONResponse:
-    """An error response as JSON."""
     return JSONResponse({"error": error_line(line), "status": status}, status, headers)
 
 
@@ -63,10 +62,8 @@ def _bad_request(error: RequestValidationError) -> JSONResponse:
 HANDLERS: dict[Any, Any] = dict.fromkeys((RequestValidationError, *KINDS, HTTPException, Exception), answer_error)
 
 
-OPEN = {"/openapi.json", "/health"}
-"""Paths that need no token; without one, /health returns its status only."""
-LARGER = {"/localise": MAX_PICTURE, "/mcp": MAX_PICTURE}
-"""Paths whose requests hold pictures, and their largest."""
+OPEN = {"/openapi.json", "/health"}  # paths that need no token; without one, /health returns its status only
+LARGER = {"/localise": MAX_PICTURE, "/mcp": MAX_PICTURE}  # paths whose requests hold pictures, and their largest
 _MAX_DROPPED = 2 * MAX_PICTURE
 _HEADERS = [
     (b"x-content-type-options", b"nosniff"),
@@ -105,7 +102,6 @@ class HttpGuard:
         await self.app(scope, receive, _with_headers(send))
 
     def _refusal(self, scope: Any, headers: dict[str, str], trusted: bool) -> Any:
-        """The response that rejects the request, or None."""
         name = headers.get("host", "")
         if self.guard.token is None and not self.guard.names_this_machine(name):
             return problem(403, f"Host '{name[:80]}' is not this machine; ask for 127.0.0.1 or localhost")

@@ -30,11 +30,9 @@ from perception.serve.bodies import Body, FramedBody, Text
 from perception.serve.requests import MAX_PICTURE, EngineBusy
 from perception.types import Lens, View
 
-MOST_PIXELS = 50_000_000
-"""Of a client's picture."""
+MOST_PIXELS = 50_000_000  # of a client's picture
 FORMATS = ("JPEG", "PNG", "WEBP", "BMP")
-WAIT = 2.0
-"""Seconds that a question waits for the map's photos to be read, which takes longer for most maps."""
+WAIT = 2.0  # seconds that a question waits for the map's photos to be read, which takes longer for most maps
 
 Picture = Annotated[str, Field(min_length=1, max_length=MAX_PICTURE, description="JPEG, PNG, WebP or BMP in base64")]
 Camera = Annotated[dict[str, Any], Field(description="ROS camera_info of the picture: image_width, camera_matrix, …")]

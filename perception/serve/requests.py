@@ -17,10 +17,8 @@ from perception.query.hit import answer_json
 from perception.query.requests import TOP, UnknownInstance, check_prompt
 
 MAX_TEXTS = 32
-MAX_BYTES = 64 << 10
-"""Largest request in bytes, JSON included; larger ones are rejected before parsing."""
-MAX_PICTURE = 8 << 20
-"""Largest request with a picture in it, which base64 makes a third longer."""
+MAX_BYTES = 64 << 10  # largest request in bytes, JSON included; larger ones are rejected before parsing
+MAX_PICTURE = 8 << 20  # largest request with a picture in it, which base64 makes a third longer
 
 
 class EngineSettings(Settings):

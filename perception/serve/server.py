@@ -16,10 +16,8 @@ from perception.serve.listening import check_address, listen, url_host
 from perception.serve.requests import ServeSettings
 
 MAX_CONNECTIONS = 256
-MAX_WAITING = MAX_CONNECTIONS // 2
-"""Largest number of connections whose next header is not complete."""
-_TOTAL_TIMEOUT = 300.0
-"""Seconds from a request's header to the end of its answer: 100 MB of points at 3 Mbit/s."""
+MAX_WAITING = MAX_CONNECTIONS // 2  # largest number of connections whose next header is not complete
+_TOTAL_TIMEOUT = 300.0  # seconds from a request's header to the end of its answer: 100 MB of points at 3 Mbit/s
 
 
 def serve(

@@ -27,10 +27,8 @@ from perception.viewer.picking import covariances
 from perception.viewer.session import HIGHLIGHT, STATE_COLORS, Session
 
 _log = logging.getLogger("perception.viewer")
-WATCH = 1.0
-"""Seconds between checks whether another program changed the map."""
-GHOST_SIZE = 0.02
-"""Side of a point of what stood elsewhere, where the map has size 10."""
+WATCH = 1.0  # seconds between checks whether another program changed the map
+GHOST_SIZE = 0.02  # side of a point of what stood elsewhere, where the map has size 10
 EDGES = np.array([(i, i | 1 << a) for i in range(8) for a in range(3) if not i >> a & 1])  # of `OrientedBox.corners`
 
 

@@ -13,8 +13,7 @@ import numpy as np
 
 from perception.geometry import sums_by
 
-MOST = 1_000_000
-"""Gaussians that a page shows; browsers sort them anew for every change of the view."""
+MOST = 1_000_000  # Gaussians that a page shows; browsers sort them anew for every change of the view
 STEPS = 24  # halvings of the interval in which the cells' side is searched
 TOO_FEW = 0.9  # share of the wanted count from which a side is good enough
 

@@ -7,10 +7,8 @@ import numpy as np
 from perception.geometry import rotations, transform
 from perception.map.write import Map
 
-PIXEL = 0.0015
-"""Angle of a click in radians: about a pixel of a laptop's window."""
-SEEN = 0.15
-"""Smallest weight in the picture, in [0, 1], at which an instance or a point is picked."""
+PIXEL = 0.0015  # angle of a click in radians: about a pixel of a laptop's window
+SEEN = 0.15  # smallest weight in the picture, in [0, 1], at which an instance or a point is picked
 
 
 def pick(gmap: Map, ids: np.ndarray, shown: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> int | None:

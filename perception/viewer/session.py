@@ -44,8 +44,7 @@ def highlight(colors: np.ndarray, ids: np.ndarray, chosen: Collection[int]) -> n
     return np.asarray(np.where(lit[:, None], glowing, dimmed))
 
 
-CROP_SIDE = 320
-"""Pixels of the longer side of the photo shown beside a selected instance."""
+CROP_SIDE = 320  # pixels of the longer side of the photo shown beside a selected instance
 
 
 class Session:
