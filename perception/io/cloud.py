@@ -176,8 +176,8 @@ def _triangles(faces: np.ndarray | Lists, vertices: int, path: Path) -> np.ndarr
     """Triangles [F, 3] int32 of faces with any number of corners, each split into a fan, in order."""
     values = faces.values if isinstance(faces, Lists) else faces
     low, high = (values.min(), values.max()) if values.size else (0, -1)
-    if low < 0 or high >= vertices:
-        raise InputError(f"{path}: a face names vertex {low if low < 0 else high}, but there are {vertices} vertices")
+    if not (low >= 0 and high < vertices):  # NaN, too
+        raise InputError(f"{path}: a face names vertex {high if low >= 0 else low}, but there are {vertices} vertices")
     if isinstance(faces, Lists):
         return _fans(faces)
     if faces.ndim != 2:

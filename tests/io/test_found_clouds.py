@@ -165,10 +165,11 @@ def test_polygons_of_one_length_become_fans(tmp_path: Path) -> None:
     assert cloud.faces.tolist() == [[f[0], f[i], f[i + 1]] for f in faces.tolist() for i in (1, 2, 3)]
 
 
-@pytest.mark.parametrize("corner", [N, -1, 2**32 + 5])
-def test_a_face_of_a_vertex_that_is_not_there(corner: int, tmp_path: Path) -> None:
-    after = "element face 1\nproperty list uchar int64 vertex_index"
-    ply(tmp_path / "a.ply", points(), after=after, tail=struct.pack("<B3q", 3, 0, 1, corner))
+@pytest.mark.parametrize("corner", [N, -1, 2**32 + 5, float("nan")])
+def test_a_face_of_a_vertex_that_is_not_there(corner: float, tmp_path: Path) -> None:
+    kind, code = ("double", "d") if isinstance(corner, float) else ("int64", "q")
+    after = f"element face 1\nproperty list uchar {kind} vertex_index"
+    ply(tmp_path / "a.ply", points(), after=after, tail=struct.pack(f"<B3{code}", 3, 0, 1, corner))
     np.savez(tmp_path / "a.npz", points=XYZ, faces=np.array([[0, 1, corner]]))
     for name in ("a.ply", "a.npz"):
         with pytest.raises(InputError, match=f"names vertex {corner}, but there are {N}"):
