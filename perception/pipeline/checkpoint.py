@@ -35,7 +35,7 @@ from perception.errors import InputError
 from perception.gaussians.train import Trainer
 from perception.inputs.readers import EXPECTED
 from perception.io.atomic import atomic_file, delete
-from perception.io.documents import refusing
+from perception.io.documents import brief, refusing
 from perception.machine import peak_memory_mib, refuse_full_disk
 from perception.map.replace import writing
 from perception.photos.video import FRAMES_RECORD
@@ -98,8 +98,11 @@ class TrainingObserver:
             if state is None:
                 continue
             if state["masks"] == self.masks or (state["masks"] is None and state["masks_enter"] <= self.masks_enter):
-                with refusing(f"{self.work / name}: is of another version ({{why}}); delete {self.work} to start over"):
+                try:
                     trainer.load(state["trainer"])
+                except (KeyError, TypeError) as error:  # fields that are others
+                    found = f"is of another version ({brief(error)})"
+                    raise InputError(f"{self.work / name}: {found}; delete {self.work} to start over") from error
                 self.entered = state["masks"] is not None  # also where more time takes progress back before that
                 self.progress.log(f"resuming at iteration {trainer.iteration}")
                 break
