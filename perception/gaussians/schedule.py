@@ -142,7 +142,6 @@ def _densify(state: TrainingState, progress: float) -> None:
         if turn % FILL_EVERY == 0:
             _fill(state, seed)
         state.arrange()
-        state.reset_statistics()
 
 
 def _grow(state: TrainingState, allowed: int, seed: int) -> None:
@@ -176,7 +175,6 @@ def _place_in_masks(state: TrainingState) -> None:
             if surplus > 0:
                 state.keep(torch.argsort(state.gaussians.opacity_logits, stable=True)[surplus:].sort().values)
             state.append(born.to(state.device))
-            state.reset_statistics()
             _note(state, f"masks: {len(born)} Gaussians added in masks that had too few")
 
 
@@ -187,7 +185,6 @@ def _clear_cameras(state: TrainingState) -> None:
     veils = torch.from_numpy(state.free_space.reached_by(state.gaussians)).to(state.device)
     if bool(veils.any()):
         state.keep(torch.nonzero(~veils).flatten())
-        state.reset_statistics()
 
 
 def _prune(state: TrainingState) -> None:
@@ -208,7 +205,6 @@ def _keep(state: TrainingState, wanted: torch.Tensor, which: str) -> None:
     if not bool(wanted.all()):
         _note(state, f"pruned: {int((~wanted).sum())} Gaussians {which}")
         state.keep(torch.nonzero(wanted).flatten())
-        state.reset_statistics()
 
 
 def _end_trial(state: TrainingState, reached: float) -> None:

@@ -167,14 +167,16 @@ class TrainingState:
         return self._assigned.get(view.name)
 
     def keep(self, rows: torch.Tensor) -> None:
-        """Keeps the Gaussians that `rows` [M] int64 selects, with their Adam moments."""
+        """Keeps the Gaussians that `rows` [M] int64 selects, with their Adam moments; statistics begin anew."""
         self.optimiser.keep(rows)
         self._sync()
+        self.reset_statistics()
 
     def append(self, born: Gaussians) -> None:
-        """Adds Gaussians with zero Adam moments."""
+        """Adds Gaussians with zero Adam moments; statistics begin anew."""
         self.optimiser.append(born.named())
         self._sync()
+        self.reset_statistics()
 
     def arrange(self) -> None:
         """Orders the Gaussians behind the held ones along a curve through space: those of a photo then lie together in
