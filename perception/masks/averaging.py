@@ -36,14 +36,16 @@ def averaged(first: Segmentation, others: Sequence[tuple[np.ndarray, np.ndarray]
     for number, node in enumerate(cut, start=1):
         leaves = tree.leaves_of(node)
         owner[leaves], sizes[number] = number, voxels[leaves].sum()
-    shared = votes.of_groups(owner - 1, len(cut)).pixels.toarray()
-    iou = shared / (sizes[1:, None] + votes.area - shared)
-    fitting = iou * np.concatenate([each[1:] for each in probability])
-    starts = np.flatnonzero(np.diff(votes.view, prepend=-1))
-    odds = np.append(0, np.maximum.reduceat(fitting, starts, axis=1).sum(axis=1) / len(segments))
+    found = votes.of_groups(owner - 1, len(cut))
+    row, _, first_of, _ = found.runs()
+    shared, mask = found.pixels.data, found.pixels.indices
+    iou = shared / (sizes[1:][found.per_entry(first_of, row)] + votes.area[mask] - shared)
+    fitting = iou * np.concatenate([each[1:] for each in probability])[mask]
+    best = np.maximum.reduceat(fitting, first_of) if len(first_of) else np.zeros(0)
+    odds = np.append(0, np.bincount(row, best, minlength=len(cut)) / len(segments))
 
     least = np.bincount(first.segment)[1:].min(initial=len(piece))  # what one segmentation keeps
-    sizes[(sizes < least) | (np.append(0, shared.sum(axis=1)) == 0)] = 0
+    sizes[(sizes < least) | (np.append(0, np.diff(found.pixels.indptr)) == 0)] = 0
     order = np.argsort(-sizes[1:], kind="stable") + 1
     order = order[sizes[order] > 0]
     rank = np.zeros(len(sizes), np.int32)

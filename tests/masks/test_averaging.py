@@ -87,6 +87,16 @@ def test_surfaces_with_nothing_or_one_thing(count: int) -> None:
     assert len(found.probability) == count + 1
 
 
+def test_many_segments_take_memory_for_those_that_overlap_alone() -> None:
+    segment = np.repeat(np.arange(1, 1201), 3)
+    tracemalloc.start()
+    found = averaged(cuts(segment, certain(segment)), [(segment, certain(segment))] * 2)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(np.unique(found.segment * 2000 + segment)) == 1200 and found.probability[1:] == pytest.approx(0.9)
+    assert peak < 10e6  # a number for each two of them would take 35 MB
+
+
 def test_groups_are_the_regions_of_most_voxels_and_take_memory_for_those_of_the_cut_alone() -> None:
     rng = np.random.default_rng(0)
     tree, segments = 50_000, 200
