@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from perception.language.ocr import TextReader
-from perception.language.printed import edit_distance
+from perception.language.printed import Texts
 from perception.progress import QUIET, Progress
 
 MOST_VIEWS = 120  # most photos read for a map, those that are best for an instance first: bounds the time
@@ -80,35 +80,58 @@ def owner_of(corners: np.ndarray, ids: np.ndarray) -> int | None:
 
 def fuse(reads: Sequence[Read]) -> list[dict[str, Any]]:
     """The texts that reads of several views agree on; see the module docstring."""
-    texts: list[dict[str, Any]] = []
-    left = list(reads)
-    while left and len(texts) < MOST_TEXTS:
-        candidates = sorted({text for _, text, _ in left})
-        support = [_by_view([read for read in left if _agree(read[1], text)], text) for text in candidates]
+    plain = ["".join(c for c in text.casefold() if c.isalnum()) for _, text, _ in reads]
+    pairs, texts, left = _Pairs(plain), list[dict[str, Any]](), np.arange(len(reads))
+    number = np.array([pairs.number[text] for text in plain], int)
+    view, score = np.array([read[0] for read in reads], int), np.array([read[2] for read in reads])
+    while len(left) and len(texts) < MOST_TEXTS:
+        candidates = sorted({reads[n][1]: number[n] for n in left.tolist()}.items())
+        agreeing = [left[pairs.agree(number[left], own)] for _, own in candidates]
+        support = [
+            _by_view(view[mine], score[mine, None] * pairs.alike(own, number[mine]))
+            for mine, (_, own) in zip(agreeing, candidates, strict=True)
+        ]
         chosen = int(np.argmax([views[:, 0].sum() for views in support]))
-        best, views = candidates[chosen], support[chosen]
-        score = 1.0 - float(np.prod(1.0 - views[:, 1]))
-        if score >= (SINGLE if len(views) == 1 or len(best) < FEW else LEAST):
-            texts.append({"text": best, "score": round(min(score, 0.99), 2)})
-        left = [read for read in left if not _agree(read[1], best)]
+        best, views = candidates[chosen][0], support[chosen]
+        sure = 1.0 - float(np.prod(1.0 - views[:, 1]))
+        if sure >= (SINGLE if len(views) == 1 or len(best) < FEW else LEAST):
+            texts.append({"text": best, "score": round(min(sure, 0.99), 2)})
+        left = np.setdiff1d(left, agreeing[chosen])
     return texts
 
 
-def _by_view(reads: Sequence[Read], text: str) -> np.ndarray:
-    """[V, 2] of each view, the largest of its reads: characters of `text` explained, and similarity with it."""
-    best: dict[int, np.ndarray] = {}
-    for view, other, score in reads:
-        short, long = sorted((_plain(text), _plain(other)), key=len)
-        explained = len(short) - edit_distance(short, long, inside=True) - UNREAD * (len(long) - len(short))
-        similarity = 1.0 - edit_distance(short, long) / max(len(long), 1)
-        best[view] = np.maximum(best.get(view, np.zeros(2)), score * np.array([explained, similarity]))
-    return np.array(list(best.values()))
+def _by_view(view: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """[V, 2] the largest of values [R, 2] of each view, at least 0; view [R]."""
+    views, index = np.unique(view, return_inverse=True)
+    best = np.zeros((len(views), 2))
+    np.maximum.at(best, index, values)
+    return best
 
 
-def _agree(a: str, b: str) -> bool:
-    short, long = sorted((_plain(a), _plain(b)), key=len)
-    return edit_distance(short, long, inside=True) <= (1 - AGREE) * len(short)
+class _Pairs:
+    """Distances of each two of some texts, each computed once. number: of each text, in order of length."""
 
+    def __init__(self, texts: Sequence[str]) -> None:
+        distinct = Texts(sorted(set(texts)))
+        self.number, self._length = distinct.number, np.array([len(text) for text in distinct.number], int)
+        self._inside, self._apart = np.zeros((2, len(self.number), len(self.number)), np.int16)  # of the shorter: row
+        for text, n in self.number.items():
+            for table, inside in ((self._inside, True), (self._apart, False)):
+                longer, distance = distinct.distances(text, len(text), inside=inside)
+                table[n, longer] = distance
 
-def _plain(text: str) -> str:
-    return "".join(c for c in text.casefold() if c.isalnum())
+    def agree(self, a: np.ndarray, b: np.ndarray | int) -> np.ndarray:
+        """Whether most of the shorter of two texts, the first of equal ones, is in the longer; numbers a, b."""
+        short, long = self._ordered(a, b)
+        return np.asarray(self._inside[short, long] <= (1 - AGREE) * self._length[short])
+
+    def alike(self, a: np.ndarray | int, b: np.ndarray) -> np.ndarray:
+        """[R, 2] characters of one explained by the other, and similarity of the two."""
+        short, long = self._ordered(a, b)
+        least, most = self._length[short], self._length[long]
+        explained = least - self._inside[short, long] - UNREAD * (most - least)
+        return np.stack([explained, 1.0 - self._apart[short, long] / np.maximum(most, 1)], axis=1)
+
+    def _ordered(self, a: Any, b: Any) -> tuple[np.ndarray, np.ndarray]:
+        first = self._length[a] <= self._length[b]
+        return np.where(first, a, b), np.where(first, b, a)

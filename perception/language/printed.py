@@ -149,7 +149,8 @@ class Texts:
     def distances(
         self, word: str, least: float, most: float = math.inf, inside: bool = False
     ) -> tuple[slice, np.ndarray]:
-        """Which texts have `least` to `most` characters, and of each `edit_distance(word, text, inside)`."""
+        """Which texts have `least` to `most` characters, and of each Levenshtein's distance of `word` and the text; if
+        `inside`, of `word` and the nearest stretch of the text."""
         some = slice(bisect_left(self._sizes, least), bisect_right(self._sizes, most))
         starts = self._starts[some.start : max(some.start, some.stop) + 1]
         if len(starts) < 2:
@@ -171,16 +172,6 @@ class Texts:
         ends = re.compile(f"\0{re.escape(word)}|{re.escape(word)}(?=\0)")
         found = [match.end() - 1 for match in ends.finditer(self._text)]
         return np.searchsorted(self._starts, np.array(found, int), side="right") - 1
-
-
-def edit_distance(a: str, b: str, inside: bool = False) -> int:
-    """Levenshtein's distance of a and b; with `inside`, of a and the stretch of b nearest to it."""
-    row = [0] * (len(b) + 1) if inside else list(range(len(b) + 1))
-    for n, x in enumerate(a, start=1):
-        last, row[0] = row[0], n
-        for m, y in enumerate(b, start=1):
-            last, row[m] = row[m], min(last + (x != y), row[m] + 1, row[m - 1] + 1)
-    return min(row) if inside else row[-1]
 
 
 def _quality(distance: np.ndarray, length: int) -> np.ndarray:

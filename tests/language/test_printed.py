@@ -6,6 +6,7 @@ import functools
 import itertools
 import sys
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,7 +18,7 @@ from perception.language import ocr
 from perception.language.base import unit_rows
 from perception.language.description import InstanceDescription
 from perception.language.ocr import Line, TextReader, make_reader
-from perception.language.printed import Printed, edit_distance, quoted_text
+from perception.language.printed import Printed, Texts, quoted_text
 from perception.query.ranking import Ranker
 
 _WORDS = (
@@ -35,12 +36,19 @@ def _brute(a: str, b: str) -> int:
     return min(_brute(a[1:], b) + 1, _brute(a, b[1:]) + 1, _brute(a[1:], b[1:]) + (a[0] != b[0]))
 
 
-def test_edit_distance_against_the_recursion() -> None:
+def _within(a: str, b: str) -> int:
+    """Of a and the stretch of b nearest to it."""
+    return min(_brute(a, b[i:j]) for i in range(len(b) + 1) for j in range(i, len(b) + 1))
+
+
+def test_distances_of_texts_against_the_recursion() -> None:
     words = ["".join(w) for n in range(4) for w in itertools.product("ab", repeat=n)] + ["kitten", "sitting"]
-    for a, b in itertools.product(words, words):
-        assert edit_distance(a, b) == _brute(a, b)
-        stretches = {b[i:j] for i in range(len(b) + 1) for j in range(i, len(b) + 1)}
-        assert edit_distance(a, b, inside=True) == min(_brute(a, s) for s in stretches)
+    texts = Texts(words)
+    for a in words:
+        for inside, brute in ((False, _brute), (True, _within)):
+            some, distance = texts.distances(a, 0, inside=inside)
+            assert some == slice(0, len(words)) and list(texts.number) == words
+            assert distance.tolist() == [brute(a, b) for b in words]
 
 
 @pytest.mark.parametrize(
@@ -197,6 +205,39 @@ def test_fusing_prefers_what_cut_off_reads_are_cut_from() -> None:
     around = [(0, "EAS", 1.0), (1, "EAS", 1.0), (2, "PEAS", 1.0), (3, "PEA", 1.0)]
     assert [e["text"] for e in fuse(around)] == ["PEAS"]
     assert [e["text"] for e in fuse([(view, "OATS", 1.0) for view in range(4)] + [(4, "OATSE", 0.9)])] == ["OATS"]
+
+
+def test_fusing_follows_the_formulas_and_compares_each_two_texts_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """800 reads of one wall took minutes."""
+    rng, compared, distances = np.random.default_rng(0), list[str](), Texts.distances
+
+    def counted(self: Texts, word: str, *rest: Any, **more: Any) -> Any:
+        compared.append(word)
+        return distances(self, word, *rest, **more)
+
+    monkeypatch.setattr(Texts, "distances", counted)
+    reads = []
+    for view, word in itertools.product(range(6), ("MILK", "milks", "Salt")):
+        text = "".join(rng.choice(list("MSlK")) if rng.random() < 0.2 else c for c in word)[: rng.integers(3, 6)]
+        reads.append((view, text, float(rng.uniform(0.7, 1))))
+    left, expected = reads, list[str]()
+    while left:
+        gain = {}
+        for text in sorted({text for _, text, _ in left}):
+            best = dict.fromkeys(range(6), 0.0)
+            for view, other, score in left:
+                short, long = sorted((text.lower(), other.lower()), key=len)
+                if _within(*sorted((other.lower(), text.lower()), key=len)) <= 0.4 * len(short):
+                    explained = len(short) - _within(short, long) - 0.5 * (len(long) - len(short))
+                    best[view] = max(best[view], score * explained)
+            gain[text] = sum(best.values())
+        chosen = max(gain, key=lambda text: gain[text])
+        expected.append(chosen)
+        pairs = [(read, sorted((read[1].lower(), chosen.lower()), key=len)) for read in left]
+        left = [read for read, pair in pairs if _within(*pair) > 0.4 * len(pair[0])]
+    found = [entry["text"] for entry in fuse(reads)]
+    assert len(found) > 1 and found == [text for text in expected if text in found]
+    assert expected[0] == found[0] and sorted(compared) == sorted(2 * [*{text.lower() for _, text, _ in reads}])
 
 
 def test_a_line_belongs_to_what_covers_most_of_it() -> None:
