@@ -88,7 +88,7 @@ def load_segmentation(folder: Path) -> Segmentation | None:
     file = folder / SEGMENTATION
     if not file.is_file():
         return None
-    return Segmentation(**read_npz(file, file, "remove it"))  # type: ignore[arg-type]
+    return Segmentation(**read_npz(file, file, f"remove {folder} and go on with --resume"))  # type: ignore[arg-type]
 
 
 def _key(view: View, source: MaskSource, depth_key: str) -> str:

@@ -10,7 +10,7 @@ import pytest
 
 from perception.errors import InputError
 from perception.masks import MaskSource, label_folder, make_source
-from perception.masks.compute import compute_masks
+from perception.masks.compute import SEGMENTATION, compute_masks, load_segmentation
 from perception.masks.label_files import label_file, load_labels, write_labels
 from perception.photos import decode as photos
 from perception.types import Lens, View
@@ -222,6 +222,13 @@ def test_photo_in_which_nothing_is_found_is_reported(tmp_path):
     report = compute_masks([view("a.jpg")], Counting(found=False), photo, tmp_path)
     assert report["empty"] == ["a.jpg"] and "nothing was found" in report["warnings"][0]
     assert not load_labels(tmp_path, view("a.jpg")).any()
+
+
+def test_of_a_damaged_segmentation_all_masks_are_to_be_made_anew(tmp_path):
+    """Beside label images that are up to date no other would be made, and the map be another."""
+    (tmp_path / SEGMENTATION).write_bytes(b"PK half a file")
+    with pytest.raises(InputError, match=rf"cannot be read .*; remove {tmp_path} and go on with --resume"):
+        load_segmentation(tmp_path)
 
 
 def test_progress_counts_every_photo(tmp_path):
