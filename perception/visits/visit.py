@@ -154,10 +154,7 @@ def open_visit(run: Run, gmap: Map, source: MaskSource, output: Path) -> Visit:
     with run.stage("look"):
         photos, light = _exposed(old, photos)
         lit = in_light(old, light)
-        shown = [look(lit, ids, compared(v), np.zeros(compared(v).photo.shape[:2])) for v in photos.views]
-        foreign = foreign_photos(run.source, gmap, shown)
-        shown = [each for each, view in zip(shown, photos.training, strict=True) if view.name not in foreign]
-        photos = _without(photos, foreign)
+        photos, shown, foreign = _of_this_place(run.source, gmap, photos, lit, ids)
         why = "does not show what the map holds there"
         left_out += _told(run, [{"name": name, "why": why} for name in foreign])
         run.progress.log(f"{len(photos.views)} photos of the visit; light {', '.join(f'{x:.2f}' for x in light)}")
@@ -197,6 +194,15 @@ def _number(name: str, other: str, views: Sequence[Any]) -> int:
     return names.index(other) - names.index(name)
 
 
-def _without(photos: Photos, names: Sequence[str]) -> Photos:
-    kept = [n for n, view in enumerate(photos.training) if view.name not in names]
-    return replace(photos, training=[photos.training[n] for n in kept], views=[photos.views[n] for n in kept])
+def _of_this_place(
+    source: Path, gmap: Map, photos: Photos, lit: Gaussians, ids: np.ndarray
+) -> tuple[Photos, list[Look], list[str]]:
+    """The photos that show the map, those held out as well; the training ones beside it, without measured depth; and
+    the names of the others, see `scene.foreign_photos`."""
+    views = [compared(view) for view in (*photos.views, *photos.held)]
+    looks = [look(lit, ids, view, np.zeros(view.photo.shape[:2])) for view in views]
+    foreign = foreign_photos(source, gmap, looks)
+    shown = [each for each in looks[: len(photos.views)] if each.view.name not in foreign]
+    training, held_out = ([v for v in part if v.name not in foreign] for part in (photos.training, photos.held_out))
+    decoded, held = ([v for v in part if v.name not in foreign] for part in (photos.views, photos.held))
+    return Photos(training, held_out, decoded, held), shown, foreign

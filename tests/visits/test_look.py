@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import torch
 from PIL import Image
 
-from perception.gaussians.model import Gaussians
+from perception.gaussians.model import Gaussians, isotropic
 from perception.gaussians.views import TrainingView, render
+from perception.pipeline.optimise import Photos
 from perception.types import View
 from perception.visits.colours import grey_photo, in_grey
 from perception.visits.look import Look, depth_at, moments, stereo_of
+from perception.visits.visit import _of_this_place
 
 H, W = 120, 160
 K = np.array([[150.0, 0, W / 2], [0, 150.0, H / 2], [0, 0, 1]])
@@ -90,3 +95,27 @@ def test_the_map_in_grey_is_the_grey_of_its_render() -> None:
     assert np.abs(255 * grey.numpy() - pillow[..., None])[inside].max() < 2.0  # two roundings to 8 bits
     view = TrainingView("a", image, None, torch.from_numpy(K).float(), pose)
     assert np.abs(grey_photo(view).photo.numpy().astype(int) - pillow[..., None]).max() <= 1
+
+
+def test_photos_of_another_place_are_left_out_also_where_they_are_held_out() -> None:
+    rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(0)
+    points, colors = rng.uniform(-1, 1, (900, 3)), torch.rand(900, 3, generator=generator)
+    scene = isotropic(points, torch.full((900,), -2.5), colors, 0.9, 2, generator)
+    posed, decoded = [], []
+    for n in range(12):
+        pose = np.eye(4)
+        pose[:3, 3] = 0.1 * n - 0.6, 0, 3
+        camera = (torch.from_numpy(a.astype(np.float32)) for a in (pose, K))
+        view = TrainingView(f"{n}.jpg", torch.zeros(H, W, 3, dtype=torch.uint8), None, *reversed([*camera]))
+        image = render(scene, view.camera_from_world, view.K, W, H, harmonics=True).colors[0].clamp(0, 1)
+        decoded.append(replace(view, photo=(255 * image).to(torch.uint8)))
+        posed.append(View(view.name, Path(view.name), K, W, H, pose))
+    for n in (0, 5):  # one of each part
+        decoded[n] = replace(decoded[n], photo=torch.randint(0, 256, (H, W, 3), generator=generator).to(torch.uint8))
+    photos = Photos(posed[1:8], [posed[0], *posed[8:]], decoded[1:8], [decoded[0], *decoded[8:]])
+    gmap: Any = SimpleNamespace(path=Path("home.gsmap"))
+    here, looks, foreign = _of_this_place(Path("visit"), gmap, photos, scene, np.zeros(900, np.int32))
+    assert sorted(foreign) == ["0.jpg", "5.jpg"]
+    names = [[view.name for view in part] for part in (here.training, here.views, [each.view for each in looks])]
+    assert names == [["1.jpg", "2.jpg", "3.jpg", "4.jpg", "6.jpg", "7.jpg"]] * 3
+    assert [v.name for v in here.held_out] == [v.name for v in here.held] == [f"{n}.jpg" for n in range(8, 12)]
