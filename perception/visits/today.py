@@ -95,18 +95,11 @@ class Today:
 
 def seen_today(visit: Visit) -> Today:
     """Judges the map's instances, adds what is new, and finds out what moved."""
-    gmap, run, progress = visit.gmap, visit.run, visit.run.progress
+    run, progress = visit.run, visit.run.progress
     with run.stage("evidence"):
         before = visit.looks(visit.gaussians, visit.ids)
         signs = _signs(visit, before)
-    entries = gmap.instances
-    judged = [(e["id"], s) for e, s in zip(entries, signs, strict=True) if s.seen and not is_removed(e)]
-    gone = [i for i, s in judged if s.score * s.log_odds < GONE]
-    means = visit.gaussians.means.double().numpy()
-    span = np.ptp(np.quantile(means, [0.02, 0.98], axis=0), axis=0).max() if len(means) else 0.0
-    building = [e["id"] for e in entries if e["id"] in gone and max(e["obb"]["extent"]) > BUILDING * span]
-    gone = [i for i in gone if i not in building]
-    haze = np.isin(visit.ids, building) & in_free_space(before, means)
+    gone, haze = _gone(visit, before, signs)
     stays = np.flatnonzero(~np.isin(visit.ids, gone) & ~haze)
     held, ids, kept = visit.gaussians.rows(torch.from_numpy(stays)), visit.ids[stays], visit.rows[stays]
     with run.stage("look"):
@@ -166,6 +159,19 @@ def _signs(visit: Visit, looks: list[Look]) -> list[Signs]:
     shares = np.array([np.sum(seen & (visit.ids == i)) / max(1, np.sum(gmap.instance_ids == i)) for i in ids])
     signs = signs_of(looks, ids, shares, np.array([min(entry["obb"]["extent"]) for entry in entries]))
     return [replace(each, score=float(entry["score"])) for each, entry in zip(signs, entries, strict=True)]
+
+
+def _gone(visit: Visit, looks: list[Look], signs: list[Signs]) -> tuple[list[int], np.ndarray]:
+    """Ids of the instances that do not stand where they stood; [R] bool: what the photos see through of walls and
+    floors, which stay unless all of one is seen through. signs: of the map's instances."""
+    gmap, means = visit.gmap, visit.gaussians.means.double().numpy()
+    judged = [(e, s) for e, s in zip(gmap.instances, signs, strict=True) if s.seen and not is_removed(e)]
+    gone = [entry for entry, s in judged if s.score * s.log_odds < GONE]
+    span = np.ptp(np.quantile(means, [0.02, 0.98], axis=0), axis=0).max() if len(means) else 0.0
+    large = [entry["id"] for entry in gone if max(entry["obb"]["extent"]) > BUILDING * span]
+    haze = np.isin(visit.ids, large) & in_free_space(looks, means)
+    stays = [i for i in large if np.sum(gmap.instance_ids == i) > np.sum(haze & (visit.ids == i))]
+    return [entry["id"] for entry in gone if entry["id"] not in stays], haze
 
 
 def _shown_before(

@@ -1,4 +1,4 @@
-"""Pieces of a moved thing that grew apart from it, in photos rendered from what truly stands there."""
+"""What goes, and pieces of a moved thing that grew apart from it, in photos rendered from what truly stands there."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from perception.config import load_config
 from perception.gaussians.model import Gaussians, isotropic
 from perception.gaussians.views import TrainingView, render
 from perception.masks.votes import MaskVotes
+from perception.visits.evidence import signs_from
 from perception.visits.growth import grouped
 from perception.visits.look import Look, look
-from perception.visits.today import _pieces
+from perception.visits.today import _gone, _pieces
 from perception.visits.visit import Visit
 from support.aimed import look_at
 
@@ -78,3 +79,21 @@ def test_two_new_things_are_two_whatever_method_made_the_map(preset: str) -> Non
     votes = MaskVotes(csr_matrix(pixels), csr_matrix((800, 6), dtype=np.float32), *masks)
     found = grouped(things, votes, np.arange(800), load_config(preset=preset))
     assert found.count == 2 and [np.unique(half).size for half in np.split(found.ids, 2)] == [1, 1]
+
+
+@pytest.mark.parametrize("seen_through", [400, 390])
+def test_a_screen_as_large_as_the_room_goes_once_all_of_it_is_seen_through(seen_through: int) -> None:
+    """And a wall stays, of which less is. All rays end 3 m away; the rest of the screen is outside of the photo."""
+    view = TrainingView("a", torch.zeros(SIDE, SIDE, 3, dtype=torch.uint8), None, K, torch.eye(4))
+    far, ids = np.full((SIDE, SIDE), 3.0, np.float32), np.repeat([4, 9], 400)
+    screen, box = block((-0.5, -0.5, 1.5), (0.5, 0.5, 1.51), 3), block((-0.1, -0.1, 1.9), (0.1, 0.1, 2.1), 4)
+    screen.means[seen_through:, 0] += 9
+    nothing = np.zeros((SIDE, SIDE))
+    looks = [Look(view, far, far, np.full((SIDE, SIDE), -1), nothing, nothing, nothing, nothing)] * 2
+    instances = [{"id": 4, "obb": {"extent": [1, 1, 0.01]}}, {"id": 9, "obb": {"extent": [0.2, 0.2, 0.2]}}]
+    gmap = SimpleNamespace(instances=instances, instance_ids=ids)
+    visit = cast(Visit, SimpleNamespace(gmap=gmap, gaussians=Gaussians.concatenate([screen, box]), ids=ids))
+    other = signs_from(np.array([3, 900, 0.1, 1, 1, 90, 900, 300, 500, 400, 50], float), 1.0)
+    gone, haze = _gone(visit, looks, [other, other])
+    assert gone == ([4, 9] if seen_through == 400 else [9])
+    assert haze.tolist() == [n < seen_through for n in range(800)]
