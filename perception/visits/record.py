@@ -120,7 +120,7 @@ def _motion_record(motion: Motion) -> dict[str, Any]:
 def joined_language(old: dict[str, np.ndarray], new: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The arrays of language.npz with the rows of `new` appended."""
     if not old or not new:
-        return old
+        return old or new
     (before, encoder), (after, _) = from_arrays(old), from_arrays(new)
     return to_arrays([*before, *after], encoder)
 

@@ -99,19 +99,19 @@ def _refuse_other_masks(gmap: Map, name: str) -> None:
         raise InputError(f"--masks: {what}, and these cut things otherwise; give masks from {before}")
 
 
-def _encoder_of(gmap: Map, name: str) -> Encoder | None:
-    """The encoder that described the map's instances; None for a map without language. InputError where `name`, of the
-    settings, is another one."""
+def _encoder_of(gmap: Map, spec: str) -> Encoder | None:
+    """The encoder `spec` of the settings, which describes what is new; None for instances that none describes.
+    InputError unless it is the one that described the map's."""
+    from perception.language.description import check_encoder
     from perception.language.encoders import make_encoder
 
-    if not gmap.language and name == gmap.setting("language", "encoder", "auto"):
-        return None
-    encoder = make_encoder(name)
-    before, now = str(gmap.language.get("encoder", "none")), "none" if encoder is None else encoder.identity
-    if before != now:
-        todo = "leave it out" if "none" in (before, now) else "give the first, or run: perception upgrade MAP"
-        raise InputError(f"language.encoder: that of {gmap.path} is {before}, that of the visit {now}; {todo}")
-    return encoder
+    encoder = make_encoder(spec)
+    if gmap.language and encoder is not None:
+        check_encoder(str(gmap.language["encoder"]), encoder.identity)
+    elif gmap.language or (gmap.instances and spec != gmap.setting("language", "encoder", "auto")):
+        what = f"the instances of {gmap.path} are described by {gmap.language.get('encoder', 'none')}"
+        raise InputError(f"language.encoder: found {spec}, but {what}; leave it out")
+    return encoder if gmap.language or not gmap.instances else None
 
 
 # ----------------------------------------------------------------------- record

@@ -15,6 +15,8 @@ from perception.config import MapConfig, load_config
 from perception.errors import InputError
 from perception.gaussians.model import Gaussians, from_points, isotropic
 from perception.gaussians.views import TrainingView
+from perception.language import encoders
+from perception.map.map import Map
 from perception.map.write import read_map, set_labels, write_map
 from perception.pipeline.changes import inputs_of
 from perception.pipeline.checkpoint import digest, fingerprint
@@ -23,9 +25,9 @@ from perception.types import View
 from perception.visits.colours import without_colours
 from perception.visits.growth import GROWING, SETTLING, trained, update_config
 from perception.visits.look import Look
-from perception.visits.record import visit_record
+from perception.visits.record import joined_language, visit_record
 from perception.visits.scene import foreign_photos, refuse_older, update_settings
-from perception.visits.update import renamed, update_map
+from perception.visits.update import _encoder_of, renamed, update_map
 from support.progress import Told
 from support.visited_map import number, write_visited_map
 
@@ -130,6 +132,33 @@ def test_another_encoder_than_that_of_the_map_is_refused(tmp_path: Path, words: 
     ):
         update_map(tmp_path / "old.gsmap", tmp_path / "photos", tmp_path / "new.gsmap", config)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["old.gsmap", "photos"]
+
+
+def test_what_is_new_is_described_by_the_encoder_of_the_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another one would be recorded, and prompts answered by that. A map without instances has none yet."""
+    known = {
+        "conse": SimpleNamespace(identity="conse-3"),
+        "clip:here": SimpleNamespace(identity="conse-3"),
+        "none": None,
+    }
+    monkeypatch.setattr(encoders, "make_encoder", {**known, "clip:other": SimpleNamespace(identity="other")}.get)
+
+    def a_map(described: bool, made_with: str, count: int = 1) -> Any:
+        language = {"encoder": np.array("conse-3")} if described else {}
+        return Map(instances=[{}] * count, language=language, info={"config": {"language": {"encoder": made_with}}})
+
+    for spec in ("conse", "clip:here"):
+        assert _encoder_of(a_map(True, "conse"), spec) is known[spec]
+    assert _encoder_of(a_map(False, "none"), "none") is _encoder_of(a_map(False, "conse"), "conse") is None
+    assert _encoder_of(a_map(False, "conse", 0), "conse") is known["conse"]
+    for described, spec in ((True, "none"), (True, "clip:other"), (False, "conse")):
+        with pytest.raises(InputError, match=r"encoder.*; (leave it out|query with the first)"):
+            _encoder_of(a_map(described, "conse" if described else "none"), spec)
+
+
+def test_what_is_new_in_a_map_without_instances_keeps_its_embeddings() -> None:
+    new = {"encoder": np.array("conse-3")}
+    assert joined_language({}, new) is new and joined_language(new, {}) is new
 
 
 def test_both_trainings_of_an_update_share_the_time_limit() -> None:
