@@ -16,18 +16,18 @@ import numpy as np
 
 from perception.gaussians.depth_start import DepthCloud
 from perception.gaussians.views import unprojected
-from perception.geometry import sums_by
+from perception.geometry import inverse_se3, sums_by
 from perception.machine import in_threads
 from perception.masks.surface import voxel_keys
 from perception.visits.evidence import AGREE, LEAST_PIXELS, mask_odds
-from perception.visits.look import Look, projected
+from perception.visits.look import Look
 
 RAYS, STEPS, FINER, NEAREST = 300, 64, 9, 0.3
-"""Rays of a mask; points on each, evenly in inverse depth, from the map's surface to NEAREST of its depth; points
-around the best one of them."""
+"""Rays of a mask; points on each, evenly in inverse depth, from the map's surface to NEAREST of its depth; finer ones
+around the best."""
 UNMEASURED, CHANGED, COVERED = 0.5, 0.5, 0.3
-"""Share of the changed pixels of a mask that stereo did not measure, and of its pixels that changed, from which its
-rays are searched; share of them that what other photos measured covers, from which they are not."""
+"""Share of a mask's changed pixels that are not measured, and of its pixels that changed, from which its rays are
+searched; share of them that is covered by what other photos measured, from which they are not."""
 OTHERS = 16
 """Most other photos by which the rays of a mask are judged."""
 LEAST_SUPPORT, LEAST_ANGLE, AGAINST = 2, 10.0, 0.2
@@ -77,12 +77,12 @@ def carved_surface(looks: Sequence[Look], changed: Sequence[np.ndarray], known: 
 
 
 def _photo(look: Look, changed: np.ndarray) -> _Photo:
-    pose = look.view.camera_from_world.double().numpy()
     colors = cv2.GaussianBlur(look.view.photo.numpy().astype(np.float32) / 255, (0, 0), BLUR)
     counts = look.mapped > 0
     if look.view.weight is not None:
         counts &= look.view.weight.numpy() > 0
-    return _Photo(look, counts, changed & counts, np.asarray(colors), -pose[:3, :3].T @ pose[:3, 3])
+    centre = inverse_se3(look.view.camera[1])[:3, 3]
+    return _Photo(look, counts, changed & counts, np.asarray(colors), centre)
 
 
 def _unmeasured_masks(photo: _Photo, known: np.ndarray, spacing: float) -> list[int]:
@@ -94,12 +94,9 @@ def _unmeasured_masks(photo: _Photo, known: np.ndarray, spacing: float) -> list[
     bare = np.bincount(labels[photo.changed & (photo.look.measured == 0)], minlength=len(areas))
     chosen = (new >= LEAST_PIXELS) & (bare > UNMEASURED * new) & (new > CHANGED * areas)
     chosen &= mask_odds(photo.look)[1] < 0
-    pixel, z = projected(photo.look.view, known)
-    column, row = np.floor(pixel).astype(np.int64).T
-    height, width = labels.shape
-    at = np.flatnonzero((z > 1e-3) & (column >= 0) & (row >= 0) & (column < width) & (row < height))
-    square = (spacing * float(photo.look.view.K[0, 0]) / z[at]) ** 2  # pixels of the surface that a point stands for
-    covered = np.bincount(labels[row[at], column[at]], square, minlength=len(areas))
+    inside, (row, column), z = photo.look.view.seen(known)
+    square = (spacing * float(photo.look.view.K[0, 0]) / z[inside]) ** 2  # pixels that a point stands for
+    covered = np.bincount(labels[row, column], square, minlength=len(areas))
     return np.flatnonzero(chosen & (covered < COVERED * areas)).tolist()
 
 
@@ -110,7 +107,7 @@ def _on_rays(photo: _Photo, label: int, photos: Sequence[_Photo]) -> np.ndarray:
     thin = slice(None, None, max(1, len(row) // RAYS))
     row, column = row[thin], column[thin]
     each, own = np.arange(len(row)), photo.colors[row, column]
-    K, pose = look.view.K.double().numpy(), look.view.camera_from_world.double().numpy()
+    K, pose = look.view.camera
 
     def swept(nearer: np.ndarray) -> tuple[np.ndarray, ...]:
         """Points [S, R, 3] and depths, costs and differences [S, R] at 0 (on the map's surface) to 1 (NEAREST)."""
@@ -134,10 +131,7 @@ def _on_rays(photo: _Photo, label: int, photos: Sequence[_Photo]) -> np.ndarray:
 
 def _others(photo: _Photo, ray: np.ndarray, photos: Sequence[_Photo]) -> list[_Photo]:
     """The OTHERS photos in which most of the points [S, 3] of a ray lie."""
-    counts = []
-    for other in photos:
-        (pixel, z), size = projected(other.look.view, ray), other.look.mapped.shape[::-1]
-        counts.append(((z > 1e-3) & ((pixel >= 0) & (pixel < size)).all(axis=1)).sum() if other is not photo else 0)
+    counts = [0 if other is photo else len(other.look.view.seen(ray)[0]) for other in photos]
     order = np.argsort(counts, kind="stable")[::-1][:OTHERS]
     return [photos[n] for n in order.tolist() if counts[n] > 0]
 
@@ -152,11 +146,8 @@ def _judged(
     best = np.full((LEAST_SUPPORT, len(points)), UNLIKE)  # other photos see other sides of it
     rays = _unit(points - photo.centre)
     for other in others:
-        look, (pixel, z) = other.look, projected(other.look.view, points)
-        column, row = np.floor(pixel).astype(np.int64).T
-        height, width = look.mapped.shape
-        at = np.flatnonzero((z > 1e-3) & (column >= 0) & (row >= 0) & (column < width) & (row < height))
-        row, column, z = row[at], column[at], z[at]
+        look, (at, (row, column), depth) = other.look, other.look.view.seen(points)
+        z = depth[at]
         mapped, measured = look.mapped[row, column], look.measured[row, column]
         reached = (z < mapped * (1 - AGREE / 2)) & ~((measured > 0) & (measured < z * (1 - AGREE)))
         reached &= other.counts[row, column]

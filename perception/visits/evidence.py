@@ -1,9 +1,9 @@
 """What the photos of a visit say about each thing of the map: still there, not there any more, or not looked at.
 
-A photo looks at a thing where the map's render shows it and no measured surface is in front of it. There three signs
-are read: whether brightness varies as the map says (correlation, which exposure and light hardly change), whether one
-mask of the photo has the thing's outline, and whether the rays end at the thing's surface or behind it. Colours alone
-count little. Their log-odds add up to the probability that the thing stands where it stood.
+A photo looks at a thing where the map's render shows it and no measured surface is in front of it. There are four
+signs: whether brightness varies as the map says (correlation, which light hardly changes), whether one mask of the
+photo has the thing's outline, the difference of colour, and whether rays end behind the thing. `sums_in` adds them up
+over the pixels of a photo, `signs_from` over all photos; `Signs` gives their log-odds.
 """
 
 from __future__ import annotations
@@ -28,27 +28,21 @@ UNSEEN = 0.12
 """Least share of a thing's surface that a visit must see to judge it."""
 WEIGHTS = {"correlation": (14.0, 0.52), "outline": (3.0, 0.60), "colour": (-8.0, 0.12), "through": (-2.0, 0.20)}
 """Log-odds of "still there" per unit of each sign, and the value at which a sign says nothing."""
-
 BLURRED = 0.35, 0.55
-"""Variance of brightness in the map over that in the photos: up to the first a low correlation does not say that a
-thing is gone, as the map is too blurred, and from the second it counts in full. The far floor of 14 made tabletops has
-.24 to .35. Of 79 things that are gone or moved there, four have less than .55; the other signs still tell these."""
-
+"""Variance of brightness in the map over that in the photos up to which a low correlation says nothing, as the map is
+blurred, and from which it counts in full: of the far floor of made tabletops .24 to .35; 4 of 79 things that went have
+less than .55."""
 FEW = 500
 """Pixels of all photos by which signs count half: things of made scenes that are gone have 690 and more."""
-
 SAME_OUTLINE = 6.0
-"""Further log-odds per unit of the outlines' IoU for a thing at a new spot, where another thing may stand."""
-
+"""Further log-odds per unit of the outlines' IoU at a new spot, where another thing may stand."""
 LOOKED, ROUGH = 2, 160
 """Photos that must have looked at a place to know what stood there, or is free; their long side in pixels, roughly."""
-
 HIDDEN = -100.0
-"""Log-odds of a thing at a new spot where no photo looks, of which nothing can be said."""
-
+"""Log-odds of a thing at a new spot where no photo looks."""
 TEMPER = 2.0
-"""Divisor of log-odds for a probability, as the signs that they add up depend on each other. Fitted on made visits: of
-65 states 94 % came true, where it says 91 %, and without it 98 %."""
+"""Divisor of log-odds for a probability, as signs depend on each other: of 65 states of made visits 94 % came true,
+where it says 91 %, and without it 98 %."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +66,8 @@ class Signs:
 
     @property
     def log_odds(self) -> float:
-        """Of the thing standing where it stood, positive for yes: `alike`, but for what a blurred map, rays that were
-        not measured, the outline of what is hardly a thing, and few pixels cannot say."""
+        """Of the thing standing where it stood: `alike`, but for what a blurred map, rays that were not measured, the
+        outline of what is hardly a thing, and few pixels cannot say."""
         told, sharp = self._told, float(sharpness(np.array(self.contrast)))
         against, other_outline = min(0.0, told["correlation"]), min(0.0, told["outline"])
         unknown = (1 - sharp) * against + (1 - self.measured) * told["through"] + (1 - self.score) * other_outline
@@ -137,22 +131,19 @@ def signs_of(looks: Sequence[Look], things: Sequence[int], shares: np.ndarray, d
     for shown in looks:
         labels = shown.labels
         areas = np.bincount(labels.ravel())
-        measured = shown.measured > 0
         for thing in np.unique(shown.ids[shown.ids >= 0]).tolist():
             if thing in number:
                 n = number[thing]
-                sums[n] += sums_in(shown, shown.ids == thing, labels, areas, measured, depths[n])
+                sums[n] += sums_in(shown, shown.ids == thing, labels, areas, depths[n])
     return [signs_from(row, float(share)) for row, share in zip(sums, shares, strict=True)]
 
 
-def sums_in(
-    shown: Look, mask: np.ndarray, labels: np.ndarray, areas: np.ndarray, measured: np.ndarray, depth: float
-) -> np.ndarray:
+def sums_in(shown: Look, mask: np.ndarray, labels: np.ndarray, areas: np.ndarray, depth: float) -> np.ndarray:
     """Of a thing in a photo, the sums of 11: photos, pixels, covariance, variances (2), IoU × pixels, labelled pixels,
     colour, rays measured, through and hit. mask [h, w]: of the thing; areas: pixels of each of the `labels` [h, w];
-    measured [h, w] bool; depth: smallest extent of the thing."""
-    near = shown.mapped * (1 - AGREE) - depth
-    mask = mask & ~(measured & (shown.measured < near))
+    depth: smallest extent of the thing."""
+    measured = shown.measured > 0
+    mask = mask & ~(measured & (shown.measured < shown.mapped * (1 - AGREE) - depth))
     pixels = int(mask.sum())
     if pixels < LEAST_PIXELS:
         return np.zeros(11)

@@ -19,10 +19,10 @@ from perception.instances.assign import LEAST_AGREEMENT, affinities, mask_shares
 from perception.instances.group import Grouping, group
 from perception.masks.votes import MaskVotes
 from perception.pipeline.checkpoint import TrainingObserver
-from perception.pipeline.optimise import Photos, Run
 from perception.visits.carving import carved_surface
 from perception.visits.evidence import AGREE, mask_odds
 from perception.visits.look import DIFFERENT, Look
+from perception.visits.visit import Visit
 
 GROWING, SETTLING = 0.16, 0.1
 """Iterations of the two legs of an update, relative to those of a new map."""
@@ -81,25 +81,25 @@ def update_config(config: MapConfig, photos: int, share: float, start: int, alon
 
 
 def trained(
-    run: Run,
+    visit: Visit,
     leg: str,
-    mark: str,
-    masks: str,
+    share: float,
     gaussians: Gaussians,
     held: int,
-    photos: Photos,
     rehearsed: Sequence[TrainingView],
-    config: MapConfig,
+    alone: bool = False,
 ) -> tuple[Gaussians, TrainRecord]:
     """Trains one leg on the photos and on what is `rehearsed`: all of the Gaussians beyond the first `held` rows, and
     the colours of those. From its checkpoint on, if there is one that began with these Gaussians: other settings of
-    instances, or more time for the leg before, give others. On the CPU."""
+    instances, or more time for the leg before, give others. On the CPU. share, alone: see `update_config`."""
+    run, photos = visit.run, visit.photos
+    config = update_config(run.config, len(photos.views), share, held + SPARE * (len(gaussians) - held), alone)
     start = hashlib.sha256(b"".join(tensor.numpy().tobytes() for tensor in gaussians.named().values())).hexdigest()
     work = run.work / f"leg-{leg}-{start[:16]}"
     work.mkdir(exist_ok=True)
     trainer = Trainer(gaussians, [*photos.views, *rehearsed], config, photos.held, run.device, held=held)
     trainer.stopping.degree_decided = True  # the map's
-    observer = TrainingObserver(work, mark, masks, 0.0, run.progress)
+    observer = TrainingObserver(work, visit.mark, "", 0.0, run.progress)  # the mark is also of the masks
     observer.take_up(trainer)
     with run.stage("train"):
         record = trainer.run(observer)
@@ -109,15 +109,14 @@ def trained(
 def joined_instances(votes: MaskVotes, ids: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """[R] int32: of the new Gaussians `rows` [R], the instance whose masks they lie in, −1 = none. ids [N]: instances
     of all Gaussians, −1 = none (the new ones among them)."""
-    count = int(ids.max(initial=-1)) + 1
-    joined = np.full(len(rows), -1, np.int32)
-    if count == 0 or len(rows) == 0:
-        return joined
-    affinity = affinities(votes, mask_shares(votes.of_groups(ids, count)), rows)[0].toarray()
+    known, number = np.unique(ids[ids >= 0], return_inverse=True)
+    if len(known) == 0 or len(rows) == 0:
+        return np.full(len(rows), -1, np.int32)
+    dense = np.full(len(ids), -1, np.int32)
+    dense[ids >= 0] = number
+    affinity = affinities(votes, mask_shares(votes.of_groups(dense, len(known))), rows)[0].toarray()
     best = affinity.argmax(axis=1)
-    good = affinity[np.arange(len(rows)), best] >= LEAST_AGREEMENT
-    joined[good] = best[good]
-    return joined
+    return np.where(affinity[np.arange(len(rows)), best] >= LEAST_AGREEMENT, known[best], -1).astype(np.int32)
 
 
 def grouped(gaussians: Gaussians, votes: MaskVotes, rows: np.ndarray, config: MapConfig) -> Grouping:

@@ -17,9 +17,9 @@ from perception.progress import QUIET, Progress
 from perception.types import View
 
 HALVED_FROM = 480
-"""Long side in pixels from which photos are compared at half the resolution, near that of the stereo depths."""
+"""Long side in pixels from which photos are compared at half the resolution, near that of stereo."""
 WINDOW = 3.0
-"""Standard deviation in pixels of the window in which brightness is compared: a few times the error of a silhouette."""
+"""Standard deviation in pixels of the window in which brightness is compared: some times the error of a silhouette."""
 DARK, BRIGHT = 0.04, 0.96
 """Colours beyond are clipped or mostly noise, and do not show the exposure."""
 DIFFERENT = 0.1
@@ -120,10 +120,8 @@ def look(gaussians: Gaussians, ids: np.ndarray, view: TrainingView, measured: np
     mapped = expected_depth(out).numpy()
     image = view.exposed(out.colors[0]).clamp(0, 1).numpy()
     photo = view.photo.numpy().astype(np.float32) / 255
-    silhouettes = render_silhouettes(gaussians, [ids], view.camera_from_world, view.K, width, height, eps2d=view.eps2d)[
-        0
-    ]
-    shown = silhouettes.ids.copy()
+    (seen,) = render_silhouettes(gaussians, [ids], view.camera_from_world, view.K, width, height, eps2d=view.eps2d)
+    shown = seen.ids.copy()
     if view.weight is not None:
         shown[view.weight.numpy() == 0] = -1
     return Look(view, mapped, measured, shown, *moments(image, photo), np.abs(image - photo).mean(axis=2))
@@ -159,7 +157,7 @@ def in_view(means: np.ndarray, scales: np.ndarray, views: Sequence[TrainingView]
 
 def projected(view: TrainingView, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pixels [P, 2] and depths [P] of points [P, 3]."""
-    pose, K = view.camera_from_world.double().numpy(), view.K.double().numpy()
+    K, pose = view.camera
     local = points @ pose[:3, :3].T + pose[:3, 3]
     z = local[:, 2]
     return local[:, :2] / np.where(np.abs(z) > 1e-6, z, 1e-6)[:, None] * np.diag(K)[:2] + K[:2, 2], z

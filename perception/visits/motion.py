@@ -1,8 +1,11 @@
-"""Which new thing of a visit is which thing that no longer stands where it stood, and how it moved.
+"""Which new thing of a visit is which thing that no longer stands where it stood, and how it moved:
 
-Two things are compared by registration of their points. The best few motions are then judged by the photos, by the same
-signs as a thing that did not move: carried to the new spot, would the photos say that it stands there? All pairs are
-assigned jointly.
+cuts_of      the parts of photos that show the new thing
+likeliest    motions from where the points of both lie on each other, the best refined
+settled      the best of all: does another one explain the photos as well, and does the thing look round?
+assigned     all pairs jointly
+
+Photos judge a motion by the signs of a thing that did not move (`evidence`): would they say that it stands there now?
 """
 
 from __future__ import annotations
@@ -16,10 +19,10 @@ import torch
 
 from perception.gaussians.model import Gaussians
 from perception.gaussians.views import TrainingView, expected_depth, render
-from perception.geometry import transform
+from perception.geometry import inverse_se3, transform
 from perception.rasterizer.rasterize import rasterizer_for
 from perception.rasterizer.types import Settings
-from perception.visits.colours import LUMA, colour_odds
+from perception.visits.colours import LOOKS, LUMA, colour_odds
 from perception.visits.evidence import WEIGHTS, Signs, signs_from, sums_in
 from perception.visits.look import Look, blurred, projected
 from perception.visits.registration import BEST, TURNED, YAWS, Points, angle_between, looks_round, register, turns
@@ -27,55 +30,45 @@ from perception.visits.registration import BEST, TURNED, YAWS, Points, angle_bet
 VISIBLE, TOUCHING = 0.3, 0.02
 """Least opacity of a pixel that shows a thing; relative depth by which it may lie behind what it stands on."""
 SIZES, LEAST_PART = (0.35, 1.6), 0.3
-"""Least and largest size of the new thing relative to the old one, which may be half hidden; least share of its points
-that lie within reach of each other, if it is that thing."""
+"""Of a new thing, which may be half hidden: size relative to the old one; least share of its points within reach."""
 HALF_HIDDEN = 0.3
 """Radii of the old thing by which the new one is less high, from which its lower part may be hidden."""
 JUDGED, LARGE, SMALL = 4, 128, 48
-"""Photos by which a motion is judged: those that show most of the new thing, from other sides; the long side in pixels
-from which their parts are halved, and from which they are to find a motion at first, when it may be far off."""
+"""Photos by which a motion is judged; long sides to which their parts are halved, at last and at first."""
 MARGIN = 0.3
 """Of the cut around a thing in a photo, relative to its sides."""
-HOPELESS = -4.0
-"""Log-odds of a first guess below which a motion is not refined."""
+HOPELESS, BEHIND = -4.0, 5.0
+"""Log-odds of a first guess below which none is refined; by which one may be behind the best to be refined as well."""
 ALIKE = 2
-"""Old things, most alike in colour, with which a new one is compared, of those that this visit misses and of those that
-an earlier one did."""
-CERTAIN = 6.0
-"""Log-odds of a motion from which no other thing is tried, unless that is as much alike."""
-TWINS = 0.15
-"""Difference of what two histograms have in common, within which two things are as much alike."""
+"""Old things, most alike in colour, that a new one is compared with: of this visit, and of earlier ones."""
+CERTAIN, TWINS = 6.0, 0.15
+"""Log-odds of a motion from which only things are tried that are as much alike; difference of looks up to which."""
 GAINS, SHORTER = 0.1, 3
-"""Log-odds below which a gain of refinement makes its steps shorter, and how much."""
-BEHIND = 5.0
-"""Log-odds by which a first guess may be behind the best one, to be refined as well."""
+"""Log-odds of a gain of refinement below which its steps become shorter, and how much."""
 ROUGH_STEP, STEP, LEAST_STEP = 0.4, 0.1, 0.03
-"""Steps of a motion in refinement, from a rough one down: radii of the thing, and radians."""
+"""Steps of a motion in refinement: radii of the thing, and radians."""
 CLOSE = 1.5
 """Log-odds within which two motions, or two look-alikes, cannot be told apart."""
 WITHIN = 0.25
-"""Share of the pixels of a moved thing that may lie just behind the surface of others: things do not go through each
-other. Where they truly stand it is up to .17, of pieces that fit somewhere by chance .3 to .5."""
+"""Share of the pixels of a moved thing that may lie just behind the surface of others: where things truly stand up to
+.17, of pieces that fit somewhere by chance .28 to .5."""
 SURE, UNLIKE, SIDE = 0.8, WEIGHTS["correlation"][1], 45.0
-"""Correlation with the photos from which a turn is sure, and below which it is not known. Between them other turns must
-be excluded, too: a carton shows the same print on two sides. Degrees between directions that see the same side."""
+"""Correlation with the photos from which a turn is sure, and below which it is not known; between, other turns must be
+excluded: a carton has one print on two sides. Degrees between directions that see the same side."""
 PRINT = 7.0
-"""Log-odds that a wrong turn of printed things costs at least; the shades of a plain round thing cost up to 6."""
+"""Log-odds that a wrong turn of printed things costs at least; shades of a plain round thing cost up to 6."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """new_from_old [4, 4] of a thing; odds: log-odds that it is the same thing, by the photos and by its colours;
-    ambiguous: another motion explains the photos as well, or may show sides of it that no visit before saw. axis [3]:
-    unit vector about which all turns do, so that the thing looks round and its turn is not known; None for others."""
+    """new_from_old [4, 4] of a thing; odds: log-odds that it is the same thing; ambiguous: another motion explains the
+    photos as well, or may show sides of it that no visit before saw. axis [3]: unit vector about which the thing looks
+    round, so that its turn is not known; None for others."""
 
     new_from_old: np.ndarray
     odds: float
     ambiguous: bool = False
     axis: np.ndarray | None = None
-
-
-# ------------------------------------------------------------------ judged by the photos
 
 
 @dataclass(frozen=True)
@@ -114,8 +107,8 @@ class Cut:
         return images, np.bincount(images.ravel())
 
     def _drawn(self, thing: Gaussians, motions: np.ndarray) -> tuple[torch.Tensor, np.ndarray, np.ndarray]:
-        """Of a thing alone after each of the motions [P, 4, 4]: colours [P, h, w, 3], opacities [P, h, w], depths
-        [P, h, w] (infinite where it is not). To move the camera the other way is the same as to move the thing."""
+        """Of a thing alone after each of the motions [P, 4, 4]: colours [P, h, w, 3], opacities and depths [P, h, w]
+        (infinite where it is not). To move the camera the other way is the same as to move the thing."""
         view, (height, width) = self.view, self.depth.shape
         cameras = torch.from_numpy((view.camera_from_world.double().numpy() @ motions).astype(np.float32))
         inputs = thing.inputs(view.camera_from_world, view.K, harmonics=True)
@@ -128,8 +121,8 @@ class Cut:
         return out.colors, alphas, depths
 
     def _before_all(self, thing: Gaussians, motions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """With a thing after each of the motions [P, 4, 4] before all else, the nearer of two surfaces being seen:
-        colours [P, h, w, 3] and depths [P, h, w], float32, and where the thing is seen [P, h, w]."""
+        """With a thing after each of the motions [P, 4, 4] before all else: colours [P, h, w, 3] and depths [P, h, w],
+        float32, and where the thing is seen [P, h, w]."""
         view, (colors, alphas, depths) = self.view, self._drawn(thing, motions)
         fronts = depths < self.depth * (1 + TOUCHING)
         own = np.where(fronts[..., None], view.exposed(colors).numpy(), 0)
@@ -144,8 +137,7 @@ class Cut:
         return np.stack([image[shown].sum(axis=0), self._photo[0][shown].sum(axis=0)]).astype(np.float64)
 
     def within(self, thing: Gaussians, motion: np.ndarray, smallest: float) -> np.ndarray:
-        """[2] pixels of a thing after a motion: all, and those behind the surface of all else by less than its least
-        extent `smallest`."""
+        """[2] pixels of a thing after a motion: all, and those less than its least extent behind all else."""
         depth = self._drawn(thing, motion[None])[2][0]
         behind = (depth >= self.depth * (1 + TOUCHING)) & (depth < self.depth * (1 + TOUCHING) + smallest)
         return np.array([np.isfinite(depth).sum(), (behind & np.isfinite(depth)).sum()])
@@ -160,7 +152,7 @@ class Cut:
             local = blurred(image)
             moment = blurred(image * gray) - local * mean, blurred(image * image) - local**2, variance
             look = Look(view, mapped[n], self.measured, shown[n], *moment, colour[n])
-            rows.append(sums_in(look, shown[n], *self._masks, self.measured > 0, smallest))
+            rows.append(sums_in(look, shown[n], *self._masks, smallest))
         return np.stack(rows)
 
 
@@ -169,14 +161,13 @@ Frame = tuple[TrainingView, np.ndarray]
 
 
 def cuts_of(frames: Sequence[Frame], points: np.ndarray, scene: Gaussians) -> list[Cut]:
-    """The parts of the JUDGED photos that show most of a new thing, points [P, 3], each the more the farther it is from
-    the direction of those before it. scene: all else."""
+    """The parts of the JUDGED photos that show most of a new thing, points [P, 3], from directions that differ. scene:
+    all else."""
     found = [(bounds, frame) for frame in frames if (bounds := _bounds(frame[0], points)) is not None]
     if not found:
         return []
     areas = np.array([(high - low).prod() for (low, high), _ in found], float)
-    rays = np.stack([_centre(frame[0]) - points.mean(axis=0) for _, frame in found])
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = _rays([view for _, (view, _) in found], points.mean(axis=0))
     chosen, apart = list[int](), np.ones(len(found))
     while len(chosen) < min(JUDGED, len(found)):
         chosen.append(int(np.argmax(areas * apart)))
@@ -185,9 +176,10 @@ def cuts_of(frames: Sequence[Frame], points: np.ndarray, scene: Gaussians) -> li
     return [_cut(*found[n][1], *found[n][0], scene) for n in chosen]
 
 
-def _centre(view: TrainingView) -> np.ndarray:
-    pose = view.camera_from_world.double().numpy()
-    return np.asarray(-pose[:3, :3].T @ pose[:3, 3])
+def _rays(views: Sequence[TrainingView], point: np.ndarray) -> np.ndarray:
+    """[V, 3] unit directions from a point [3] to the cameras of the views."""
+    rays = np.stack([inverse_se3(view.camera[1])[:3, 3] for view in views]) - point
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
 def _bounds(view: TrainingView, points: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
@@ -221,24 +213,40 @@ Found = tuple[Signs, np.ndarray]
 """The signs of a motion and new_from_old [4, 4]."""
 
 
-def motions_of(
-    old: Gaussians, new: Gaussians, frames: Sequence[Frame], scene: Gaussians, up: np.ndarray, depth: float
-) -> tuple[list[Found], list[Cut]]:
-    """The likeliest motions from an old thing to a new one, the best first, and the parts of photos by which they were
-    judged; none where their sizes differ. scene: all else; depth: smallest extent of the old thing."""
+def motion_between(
+    old: Gaussians,
+    new: Gaussians,
+    frames: Sequence[Frame],
+    scene: Gaussians,
+    up: np.ndarray,
+    depth: float,
+    alike: float,
+    seen: np.ndarray,
+) -> Motion | None:
+    """How an old thing came to where a new one stands; None where it is another one. scene: all else; depth: smallest
+    extent of the old thing; alike: see `colours.looks_alike`; seen: see `look.seen_from`."""
     a, whole = Points.of(old), Points.of(new)
     if len(a.points) < 8 or len(whole.points) < 8:
-        return [], []
+        return None
     b = whole.within(a.radius)
     fits = SIZES[0] <= b.radius / max(a.radius, 1e-9) <= SIZES[1] and len(b.points) >= LEAST_PART * len(whole.points)
     cuts = cuts_of(frames, b.points, scene) if fits and len(b.points) >= 8 else []
     if not cuts:
-        return [], []
+        return None
+    found = likeliest(old, a, b, cuts, up, depth)
+    if found[0][0].same + LOOKS[0] * (alike - LOOKS[1]) < HOPELESS:
+        return None
+    return settled(old, found, cuts, up, depth, alike, seen)
+
+
+def likeliest(old: Gaussians, a: Points, b: Points, cuts: Sequence[Cut], up: np.ndarray, depth: float) -> list[Found]:
+    """The motions of an old thing that photos support best, roughly refined, the best first. They start where points
+    `a` of it lie on those of a new one, `b`."""
     starts = [pose for _, pose in register(a, b, up)] + _upright_starts(a, b, up)
     small = [cut.halved_to(SMALL) for cut in cuts]
     first = _distinct(judged(old, starts, small, depth))[:BEST]
     rough = [refined(old, found, small, depth, ROUGH_STEP, STEP) for found in first]
-    return sorted(judged(old, [pose for _, pose in _distinct(rough)], cuts, depth), key=_falling), cuts
+    return sorted(judged(old, [pose for _, pose in _distinct(rough)], cuts, depth), key=_falling)
 
 
 def _falling(motion: Found) -> float:
@@ -255,8 +263,8 @@ def _distinct(found: Sequence[Found]) -> list[Found]:
 
 
 def _upright_starts(a: Points, b: Points, up: np.ndarray) -> list[np.ndarray]:
-    """Turns about the vertical that bring box a onto box b, the lowest points onto each other; where b is less high,
-    also the highest ones, as of a thing that is half hidden the upper part shows."""
+    """Turns about the vertical that bring box a onto box b, their lowest points onto each other; where b is less high,
+    also the highest, which show of a thing that is half hidden."""
     poses = []
     for rotation in turns(up, YAWS):
         turned = a.points @ rotation.T
@@ -277,8 +285,8 @@ def settled(
     alike: float,
     seen: np.ndarray,
 ) -> Motion | None:
-    """The best of the two best motions after refinement, and whether the other explains the photos as well; None where
-    much of the thing would lie within others. alike: see `colours.looks_alike`; seen: see `look.seen_from`."""
+    """The best of the two best motions after refinement; None where much of the thing would lie within others. alike:
+    see `colours.looks_alike`; seen: see `look.seen_from`."""
     likely = [each for each in found[:2] if each[0].same > found[0][0].same - BEHIND]
     refine = _distinct([refined(old, each, cuts, depth, STEP, LEAST_STEP) for each in likely])
     (signs, pose), others = refine[0], refine[1:]
@@ -298,8 +306,8 @@ def settled(
 
 
 def round_about(old: Gaussians, motion: Found, cuts: Sequence[Cut], up: np.ndarray, depth: float) -> np.ndarray | None:
-    """The axis [3] about which a moved thing looks round, by its points and by the photos; None where there is none.
-    It is the vertical `up`, or one of the main axes of the points. Shades turn with a thing, though light does not."""
+    """The axis [3] about which a moved thing looks round, by its points and by the photos: the vertical `up`, or one of
+    the main axes of the points; None without."""
     (signs, pose), points = motion, Points.of(old)
     middle = pose[:3, :3] @ np.quantile(points.points, [0.02, 0.98], axis=0).mean(axis=0) + pose[:3, 3]
     main = np.linalg.svd(points.points - points.points.mean(axis=0), full_matrices=False)[2]
@@ -318,8 +326,7 @@ def other_sides(
     """Whether after another turn about the vertical photos would show sides of a moved thing that no visit before saw,
     while the other photos do not contradict it. seen: see `look.seen_from`."""
     middle = pose[:3, :3] @ np.median(Points.of(old).points, axis=0) + pose[:3, 3]
-    rays = np.stack([_centre(cut.view) - middle for cut in cuts])
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = _rays([cut.view for cut in cuts], middle)
     motions = np.stack([_about(turn, middle) @ pose for turn in turns(up, YAWS)])
     sums = np.stack([cut.sums(old, motions, depth) for cut in cuts], axis=1)
     for rows, motion in zip(sums[1:], motions[1:], strict=True):
@@ -342,9 +349,8 @@ def judged(old: Gaussians, motions: Sequence[np.ndarray], cuts: Sequence[Cut], d
 
 
 def refined(old: Gaussians, start: Found, cuts: Sequence[Cut], depth: float, step: float, least: float) -> Found:
-    """The motion near `start` that the photos support best. In each round a parabola through three values of each of
-    six steps, along and about three axes, gives the next motion; steps become shorter where that is near, or no better.
-    """
+    """The motion near `start` that the photos support best. In each round parabolas through three values of six steps,
+    along and about three axes, give the next motion; steps become shorter where that is near, or no better."""
     from scipy.spatial.transform import Rotation
 
     points = Points.of(old)

@@ -15,6 +15,7 @@ import torch
 
 from perception.gaussians.model import as_gaussians
 from perception.gaussians.views import TrainingView, rgb_image
+from perception.geometry import camera_centres
 from perception.localise.localiser import Localised, Localiser, NewPhoto
 from perception.map.map import Map
 from perception.photos.video import motion_between
@@ -48,9 +49,10 @@ def checked_poses(run: Run, gmap: Map, photos: Photos) -> Photos:
     after = misplaced(gmap, moved.views)
     if after >= before:
         return photos
-    centres = [np.linalg.norm(_centre(placed[v.name]) - _centre(v.camera_from_world)) for v in given]
+    poses = [placed[view.name] for view in given], [view.camera_from_world for view in given]
+    shifts = np.linalg.norm(np.subtract(*(camera_centres(np.stack(each)) for each in poses)), axis=1)
     unit, width = "m" if gmap.metric else "units", photos.training[0].width
-    off = f"off by {np.median(centres):.2g} {unit}, so that its render is {before * width:.1f} pixels off the photos"
+    off = f"off by {np.median(shifts):.2g} {unit}, so that its render is {before * width:.1f} pixels off the photos"
     run.progress.log(f"the given poses do not fit the map ({off}): localised in it, {after * width:.1f} pixels")
     return moved
 
@@ -96,7 +98,3 @@ def with_poses(photos: Photos, placed: dict[str, np.ndarray]) -> Photos:
         [replace(view, camera_from_world=tensors[view.name]) for view in part] for part in (photos.views, photos.held)
     )
     return Photos(training, held_out, views, held)
-
-
-def _centre(pose: np.ndarray) -> np.ndarray:
-    return np.asarray(-pose[:3, :3].T @ pose[:3, 3])

@@ -1,8 +1,5 @@
-"""Registration of the points of two things, and rigid motions of Gaussians.
-
-The points of a new thing, with their colours, are brought onto those of an old one (ICP, Besl and McKay 1992) from many
-starting rotations.
-"""
+"""Registration of the coloured points of two things (ICP, Besl and McKay 1992) from many starting rotations, and rigid
+motions of Gaussians."""
 
 from __future__ import annotations
 
@@ -31,12 +28,10 @@ SOLID = 0.1
 REACH = 2.2
 """Radii of a thing (root of the mean squared distance to its centre) within which all of it lies."""
 STRAY = 3.0
-"""Median distances to the middle of a thing from which a point is a stray: the ends of a rod are at 2, of a cross at 2,
-the rim of a plate at 1.4."""
+"""Median distances to the middle of a thing from which a point is a stray: the ends of a rod or a cross are at 2."""
 ROUND, DARKEST = 1.6, 0.1
-"""Distance of the points of a thing after a turn, relative to that between its halves, up to which it may be round:
-bowls and plates have 1.1 to 1.4, cans and cartons, whose print the photos see, 1.4 to 2.4. Least sum of colours of a
-hue."""
+"""Distance of the points of a thing after a turn, relative to that between its halves, up to which it may be round: of
+bowls and plates 1.1 to 1.4, of cans and cartons 1.4 to 2.4. Least sum of colours of a hue."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +82,7 @@ def compact(points: np.ndarray) -> np.ndarray:
 
 def register(old: Points, new: Points, up: np.ndarray) -> list[tuple[float, np.ndarray]]:
     """(mean residual in radii of the old thing, new_from_old [4, 4]) of the best motions, the best first, and of all
-    turns about the vertical that differ from them: points of a half hidden thing alone cannot tell."""
+    turns about the vertical that differ from them, as points of a half hidden thing cannot tell."""
     from scipy.spatial import cKDTree
 
     radius, old = max(old.radius, 1e-9), old.some(MOST)

@@ -18,7 +18,6 @@ from perception.visits.evidence import AGREE, sight
 
 SHOWN, HIDDEN = 0.9, 0.05
 """Opacity from which the map shows a pixel, and share of something else in it from which it does not count."""
-
 OVERLAP, SAMPLES = 0.1, 5000
 """Least share of what the visit sees in a view, relative to the view that shows most; points by which it is told."""
 MOST = 64

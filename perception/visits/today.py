@@ -1,7 +1,16 @@
-"""What stands where today: the map's instances judged, new ones added, and those that moved recognised."""
+"""What stands where today, from the photos of a visit beside the map, in this order:
+
+gone       which of the map's instances the photos contradict                        `_signs`, `_gone`
+grown      what stays, and new Gaussians where the photos show another surface       `_grown`
+things     of the new ones those in no instance's masks, grouped                     `_grouped`, `_true`
+pairs      which thing is which gone one, and how it moved; pieces of moved ones     `_moved`, `_apart`, `_pieces`
+added      ids of the things that are left                                           `_added`
+settled    moved things with their own Gaussians; colours of all that was looked at  `_settled`
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -13,59 +22,36 @@ from perception.gaussians.state import TrainRecord
 from perception.instances.group import Grouping
 from perception.instances.votes import mask_votes
 from perception.map.history import is_removed
-from perception.visits.colours import LOOKS, in_grey, looks_alike
+from perception.map.map import Map
+from perception.visits.colours import in_grey, looks_alike
 from perception.visits.evidence import Signs, in_free_space, looked_at, seen_rows, signs_of
-from perception.visits.growth import (
-    GROWING,
-    SETTLING,
-    SPARE,
-    grouped,
-    joined_instances,
-    new_surface,
-    trained,
-    update_config,
-)
+from perception.visits.growth import GROWING, SETTLING, grouped, joined_instances, new_surface, trained
 from perception.visits.look import Look
-from perception.visits.motion import (
-    ALIKE,
-    CERTAIN,
-    CLOSE,
-    HOPELESS,
-    TWINS,
-    Motion,
-    assigned,
-    motions_of,
-    settled,
-)
+from perception.visits.motion import ALIKE, CERTAIN, CLOSE, TWINS, Motion, assigned, motion_between
 from perception.visits.registration import REACH, Points, carried
-from perception.visits.visit import Visit, gaussians_of
+from perception.visits.visit import Owned, Visit, gaussians_of
 
 UP = (0.0, 0.0, 1.0)
 """Of a map that does not record gravity."""
 GONE = -0.5
 """Log-odds of standing where it stood, times the score, below which a thing does not. Of 126 things of made scenes that
-went one lies between this and 0, but floors and walls of which little was measured do, and what is hardly a thing."""
+went one lies between this and 0, as do floors and walls of which little was measured."""
 BUILDING = 0.6
-"""Of what a visit may see, the share from which a thing is a wall or a floor: it stays, and only what of its Gaussians
-the photos see through goes."""
+"""Of what a visit may see, the share from which a thing is a wall or a floor."""
 INSTEAD = 0.3
 """Share of a new thing's pixels where the old map showed things that are gone, from which it was not there before."""
 FRAGMENT = 0.3, 3
-"""A new group of a score below, and of less than this many times the least Gaussians of a group, is a piece of what
-stands beside it, no thing; most things score .8 and more."""
-
+"""A new group of a lower score, and of less than this many times the least Gaussians of a group, is a piece of what
+stands beside it; most things score .8 and more."""
 ALONG = 0.75, 0.25
 """Share of the Gaussians of a piece that lie within this many radii of the thing that it is of."""
 PHOTOS, GREW = 2, 1.0
 """Least photos of a new thing, and log-odds that they show it as it grew: of 47 in made scenes true ones have 2 and
 more, errors at walls and in the air up to .6."""
 LEAST_SCORE = 0.5
-"""Of a new thing. Of 21 in ten made scenes none has less than .55; two of three in real scenes where nothing changed
-have .33 and .37."""
+"""Of a new thing: of 21 in ten made scenes none has less than .55; two of three errors in real scenes have less."""
 OUTLINED = 0.5
 """Least IoU of a new thing with masks of the photos, relative to the median of those that stand where they stood."""
-
-
 LOOKED_AT = 0.3
 """Share of a new thing's place from which earlier photos looked there: of 24 things that came in made scenes .7 and
 more."""
@@ -73,19 +59,20 @@ more."""
 New = Literal["added", "known", "hidden"]
 """Of what the map has no instance: it came, the map showed it and did not know it as a thing, or no photo looked there
 before."""
+Thing = tuple[np.ndarray, float]
+"""The rows of new Gaussians that are one thing, and its score."""
+Pairs = dict[int, tuple[int, Motion]]
+"""By id of an instance that was gone: the number of the thing that it is, and its motion."""
 
 
 @dataclass
 class Today:
-    """What stands where today: the Gaussians, of which the first rows are the rows `kept` [H] of the map; ids [N] int32
-    instance, `membership` [N], part_ids [N]; signs of the map's instances, in their order; `gone`: ids of those that do
-    not stand where they stood; motions by id; `added`: of the new ones, by id, the score and how it is new."""
+    """What stands where today. owned: the Gaussians, of which the first are the rows `kept` [H] of the map; signs of
+    the map's instances, in their order; `gone`: ids of those that do not stand where they stood; motions by id;
+    `added`: of the new ones, by id, the score and how it is new."""
 
-    gaussians: Gaussians
+    owned: Owned
     kept: np.ndarray
-    ids: np.ndarray
-    membership: np.ndarray
-    part_ids: np.ndarray
     signs: list[Signs]
     gone: list[int]
     motions: dict[int, Motion]
@@ -95,61 +82,45 @@ class Today:
 
 def seen_today(visit: Visit) -> Today:
     """Judges the map's instances, adds what is new, and finds out what moved."""
-    run, progress = visit.run, visit.run.progress
+    gmap, run = visit.gmap, visit.run
     with run.stage("evidence"):
         before = visit.looks(visit.gaussians, visit.ids)
         signs = _signs(visit, before)
-    gone, haze = _gone(visit, before, signs)
-    stays = np.flatnonzero(~np.isin(visit.ids, gone) & ~haze)
-    held, ids, kept = visit.gaussians.rows(torch.from_numpy(stays)), visit.ids[stays], visit.rows[stays]
-    with run.stage("look"):
-        looks = visit.looks(held, ids)
-    new = new_surface(looks, held, run.config.train.budget or len(visit.gaussians), run.config.seed)
-    progress.log(f"{len(gone)} things do not stand where they stood; {len(new)} points of new surface")
-    config = update_config(run.config, len(visit.photos.views), GROWING, len(held) + SPARE * len(new))
-    grown, record = held, TrainRecord()
-    if len(new):
-        both, mark = Gaussians.concatenate([held, new]), visit.masks["identity"]
-        memory = visit.rehearsed(held, Gaussians.concatenate([visit.part(np.isin(visit.ids, gone)), new]))
-        grown, record = trained(run, "grow", visit.mark, mark, both, len(held), visit.photos, memory, config)
-
+        gone, haze = _gone(visit, before, signs)
+    stays = ~np.isin(visit.ids, gone) & ~haze
+    grown, record = _grown(visit, stays, gone)
     with run.stage("instances"):
-        rows = np.arange(len(held), len(grown))
-        votes = mask_votes(Nearby(grown), visit.photos.views, half_resolution=run.config.losses.half_resolution)
-        ids = np.concatenate([ids, np.full(len(rows), -1, np.int32)])
-        known, number = np.unique(ids[ids >= 0], return_inverse=True)
-        dense = np.full(len(ids), -1, np.int32)
-        dense[ids >= 0] = number
-        joined = joined_instances(votes, dense, rows)
-        ids[rows] = np.append(known, -1)[joined]
-        free = rows[joined < 0]
-        made = _without_fragments(grouped(grown, votes, free, run.config), run.config.instances.min_cluster_size)
-    things = [(free[made.ids == n], float(made.scores[n])) for n in range(made.count) if (made.ids == n).any()]
+        owned, things = _grouped(visit, grown, visit.rows[stays])
     with run.stage("evidence"):
-        old, ground = _shown_before(visit, before, signs, grown, things, gone)
-        made = replace(made, ids=np.where(np.isin(free, _rows(things, ground)), -1, made.ids))
-        stands = [j for j in range(len(things)) if j not in ground]
-        things, old = [things[j] for j in stands], {n for n, j in enumerate(stands) if j in old}
+        things, known = _true(visit, before, signs, grown, things, gone)
     with run.stage("motion"):
         pairs = _moved(visit, grown, things, gone)
-    whole = {j: carried(visit.thing(i), motion.new_from_old) for i, (j, motion) in pairs.items()}
-    things = _apart(things, grown.means.double().numpy(), whole, run.config.instances.min_cluster_size)
-    with run.stage("motion"):
+        whole = {j: carried(visit.thing(i), motion.new_from_old) for i, (j, motion) in pairs.items()}
+        things = _apart(things, grown.means.double().numpy(), whole, run.config.instances.min_cluster_size)
         pieces = _pieces(visit, grown, things, whole)
-    pairs = {i: (j, motion) for i, (j, motion) in pairs.items() if j not in pieces}
-    return _settled(visit, grown, kept, ids, made, free, signs, gone, things, old, pairs, pieces, record)
+        pairs = {i: pair for i, pair in pairs.items() if pair[0] not in pieces}
+        taken = {j for j, _ in pairs.values()} | pieces
+    start = np.count_nonzero(stays)
+    fresh = np.arange(start, len(grown))
+    looked, through = looked_at(as_gaussians(gmap), gmap.views, grown.means[fresh].double().numpy())
+    added = _added(gmap, things, known, taken, [looked[rows - start].mean() for rows, _ in things])
+    for i, (j, _) in added.items():
+        owned.ids[things[j][0]] = i
+    own = np.isin(fresh, _rows(things))
+    owned.membership[fresh[~own & (owned.ids[fresh] < 0)]] = 0
+    # Other new surface through which earlier photos saw stands where nothing did: an error.
+    leaves = np.append(_rows([things[j] for j in taken]), fresh[through & ~own])
+    final, kept, last = _settled(
+        visit, owned, visit.rows[stays], leaves, fresh[own], pairs, gone, not record.iterations
+    )
+    scores: dict[int, tuple[float, New]] = {i: (things[j][1], new) for i, (j, new) in added.items()}
+    motions = {i: motion for i, (_, motion) in pairs.items()}
+    return Today(final, kept, signs, gone, motions, scores, TrainRecord.joined([record, last], "leg"))
 
 
-def _rows(things: list[tuple[np.ndarray, float]], numbers: set[int]) -> np.ndarray:
-    """The rows of the things with these numbers."""
-    return np.concatenate([np.zeros(0, np.int64), *(things[j][0] for j in sorted(numbers))])
-
-
-def _without_fragments(made: Grouping, least: int) -> Grouping:
-    """The grouping without what is small and in hardly any mask. least: Gaussians of a group."""
-    sizes = np.bincount(made.ids[made.ids >= 0], minlength=made.count)
-    fragments = np.flatnonzero((np.asarray(made.scores) < FRAGMENT[0]) & (sizes < FRAGMENT[1] * least))
-    return replace(made, ids=np.where(np.isin(made.ids, fragments), -1, made.ids))
+def _rows(things: Sequence[Thing]) -> np.ndarray:
+    """The rows of the things."""
+    return np.concatenate([np.zeros(0, np.int64), *(rows for rows, _ in things)])
 
 
 def _signs(visit: Visit, looks: list[Look]) -> list[Signs]:
@@ -174,22 +145,50 @@ def _gone(visit: Visit, looks: list[Look], signs: list[Signs]) -> tuple[list[int
     return [entry["id"] for entry in gone if entry["id"] not in stays], haze
 
 
-def _shown_before(
-    visit: Visit,
-    before: list[Look],
-    known: list[Signs],
-    grown: Gaussians,
-    things: list[tuple[np.ndarray, float]],
-    gone: list[int],
-) -> tuple[set[int], set[int]]:
-    """Numbers of the things that the old map shows as the photos do, `before`: it only did not know them as things.
-    A thing in front of one that is `gone`, or in its place, is none of these. Numbers of those that no two photos show
-    as they grew, or that have the outline of no mask: they are ground that was hidden until now, or errors. known:
-    signs of the map's instances."""
-    ids = np.full(len(grown), -1, np.int32)
-    for j, (rows, _) in enumerate(things):
-        ids[rows] = j
-    after = visit.looks(grown, ids)
+def _grown(visit: Visit, stays: np.ndarray, gone: list[int]) -> tuple[Gaussians, TrainRecord]:
+    """The Gaussians that stay, `stays` [R] bool, then new ones on the surface that these do not explain, trained."""
+    run, held = visit.run, visit.part(stays)
+    with run.stage("look"):
+        looks = visit.looks(held, visit.ids[stays])
+    new = new_surface(looks, held, run.config.train.budget or len(visit.gaussians), run.config.seed)
+    run.progress.log(f"{len(gone)} things do not stand where they stood; {len(new)} points of new surface")
+    if not len(new):
+        return held, TrainRecord()
+    memory = visit.rehearsed(held, Gaussians.concatenate([visit.part(np.isin(visit.ids, gone)), new]))
+    return trained(visit, "grow", GROWING, Gaussians.concatenate([held, new]), len(held), memory)
+
+
+def _grouped(visit: Visit, grown: Gaussians, kept: np.ndarray) -> tuple[Owned, list[Thing]]:
+    """What has grown, of which the first are the rows `kept` [H] of the map. New Gaussians belong to the instances in
+    whose masks they lie; the others are grouped to things."""
+    config, fresh = visit.run.config, np.arange(len(kept), len(grown))
+    none, old = np.full(len(fresh), -1, np.int32), visit.owned(kept)
+    votes = mask_votes(Nearby(grown), visit.photos.views, half_resolution=config.losses.half_resolution)
+    joined = joined_instances(votes, np.append(old.ids, none), fresh)
+    free = fresh[joined < 0]
+    made = _without_fragments(grouped(grown, votes, free, config), config.instances.min_cluster_size)
+    sure = np.ones(len(fresh), np.float32)
+    sure[joined < 0] = made.membership
+    pairs = (old.ids, joined), (old.membership, sure), (old.part_ids, none)
+    things = ((free[made.ids == n], float(made.scores[n])) for n in range(made.count))
+    return Owned(grown, *map(np.concatenate, pairs)), [thing for thing in things if len(thing[0])]
+
+
+def _without_fragments(made: Grouping, least: int) -> Grouping:
+    """The grouping without what is small and in hardly any mask. least: Gaussians of a group."""
+    sizes = np.bincount(made.ids[made.ids >= 0], minlength=made.count)
+    fragments = np.flatnonzero((np.asarray(made.scores) < FRAGMENT[0]) & (sizes < FRAGMENT[1] * least))
+    return replace(made, ids=np.where(np.isin(made.ids, fragments), -1, made.ids))
+
+
+def _true(
+    visit: Visit, before: list[Look], known: list[Signs], grown: Gaussians, things: list[Thing], gone: list[int]
+) -> tuple[list[Thing], set[int]]:
+    """The things that photos show as they grew, with the outline of a mask: the others are ground that was hidden until
+    now, or errors. And the numbers of those that the old map shows as the photos do, `before`: it only did not know
+    them as things. What stands in front of a thing that is `gone`, or in its place, is none of these. known: signs of
+    the map's instances."""
+    after = visit.looks(grown, _numbered(len(grown), things))
     looks = [replace(old, ids=new.ids) for old, new in zip(before, after, strict=True)]
     pixels, instead = np.zeros(len(things)), np.zeros(len(things))
     for old, new in zip(before, looks, strict=True):
@@ -198,45 +197,47 @@ def _shown_before(
     numbers, shares = range(len(things)), np.ones(len(things))
     signs = signs_of(looks, numbers, shares, shares * np.inf)  # what is in front of the old surface counts, too
     grew = signs_of(after, numbers, shares, shares * 0)
-    fresh = instead > INSTEAD * pixels
-    stood = {j for j, each in enumerate(signs) if each.photos and each.alike > 0 and not fresh[j]}
     usual = [each.outline for each in known if each.log_odds > 0 and np.isfinite(each.outline)]
     least = OUTLINED * float(np.median(usual or 1.0))
     true = [
-        new.photos >= PHOTOS and new.alike >= GREW and not old.outline < least
-        for old, new in zip(signs, grew, strict=True)
+        j
+        for j, (old, new) in enumerate(zip(signs, grew, strict=True))
+        if new.photos >= PHOTOS and new.alike >= GREW and not old.outline < least
     ]
-    return stood, {j for j, each in enumerate(true) if not each}
+    stood = (signs[j].photos and signs[j].alike > 0 and not instead[j] > INSTEAD * pixels[j] for j in true)
+    return [things[j] for j in true], {n for n, each in enumerate(stood) if each}
 
 
-def _moved(
-    visit: Visit, grown: Gaussians, things: list[tuple[np.ndarray, float]], gone: list[int]
-) -> dict[int, tuple[int, Motion]]:
-    """By id of an instance that is gone, or was already at an earlier visit: the number of the new thing that it is,
-    and its motion."""
+def _numbered(count: int, things: Sequence[Thing]) -> np.ndarray:
+    """[N] int32 number of the thing that each of `count` Gaussians belongs to, −1 = none."""
+    ids = np.full(count, -1, np.int32)
+    for j, (rows, _) in enumerate(things):
+        ids[rows] = j
+    return ids
+
+
+def _moved(visit: Visit, grown: Gaussians, things: list[Thing], gone: list[int]) -> Pairs:
+    """Which thing is which instance that is gone, or was already at an earlier visit."""
     lost = [*gone, *visit.away]
     if not lost or not things:
         return {}
-    olds = {i: visit.thing(i) for i in lost}
-    depth = {entry["id"]: min(entry["obb"]["extent"]) for entry in visit.gmap.instances}
+    olds = [visit.thing(i) for i in lost]
+    depths = {entry["id"]: min(entry["obb"]["extent"]) for entry in visit.gmap.instances}
     gravity = visit.gmap.info.get("gravity")
     up = np.array(UP) if gravity is None else -np.array(gravity["direction"], np.float64)
-    frames, seen = visit.frames, {i: visit.seen_from(i) for i in lost}
+    frames, seen = visit.frames, [visit.seen_from(i) for i in lost]
     odds, motions = np.full((len(lost), len(things)), -np.inf), dict[tuple[int, int], Motion]()
     for j, (own, _) in enumerate(things):
         new = grown.rows(torch.from_numpy(own))
         rest = grown.rows(torch.from_numpy(np.setdiff1d(np.arange(len(grown)), own)))
-        alike = [looks_alike(olds[i], new) for i in lost]
+        alike = [looks_alike(old, new) for old in olds]
         falling = np.argsort(alike, kind="stable")[::-1].tolist()
         kinds = ([a for a in falling if (lost[a] in visit.away) is away] for away in (False, True))
         likely = sorted((a for kind in kinds for a in kind[:ALIKE]), key=falling.index)
         for a in likely:
             if odds[:, j].max() > CERTAIN and alike[a] < alike[likely[0]] - TWINS:
                 break
-            found, cuts = motions_of(olds[lost[a]], new, frames, rest, up, depth[lost[a]])
-            if not found or found[0][0].same + LOOKS[0] * (alike[a] - LOOKS[1]) < HOPELESS:
-                continue
-            motion = settled(olds[lost[a]], found, cuts, up, depth[lost[a]], alike[a], seen[lost[a]])
+            motion = motion_between(olds[a], new, frames, rest, up, depths[lost[a]], alike[a], seen[a])
             if motion is not None:
                 odds[a, j], motions[a, j] = motion.odds, motion
         visit.run.progress.update("motions", j + 1, len(things))
@@ -248,9 +249,7 @@ def _moved(
     return pairs
 
 
-def _apart(
-    things: list[tuple[np.ndarray, float]], means: np.ndarray, whole: dict[int, Gaussians], least: int
-) -> list[tuple[np.ndarray, float]]:
+def _apart(things: list[Thing], means: np.ndarray, whole: dict[int, Gaussians], least: int) -> list[Thing]:
     """The things; of those that are moved ones, as these stand now (`whole`, by number), what is out of their reach is
     a thing of its own, as masks may join two. means [N, 3] of all Gaussians; least: of a thing."""
     result = list(things)
@@ -263,100 +262,75 @@ def _apart(
     return result
 
 
-def _pieces(
-    visit: Visit, grown: Gaussians, things: list[tuple[np.ndarray, float]], whole: dict[int, Gaussians]
-) -> set[int]:
+def _pieces(visit: Visit, grown: Gaussians, things: list[Thing], whole: dict[int, Gaussians]) -> set[int]:
     """Numbers of the things that are pieces of another that moved, as masks may cut the legs off a chair: they lie
     along it as it stands now (`whole`, by number), and the photos show as well without them what they show."""
     from scipy.spatial import cKDTree
 
-    means, stays = grown.means.double().numpy(), np.setdiff1d(np.arange(len(grown)), _rows(things, set(whole)))
-    found = set[int]()
+    means, found = grown.means.double().numpy(), set[int]()
+    stays = np.setdiff1d(np.arange(len(grown)), _rows([things[j] for j in whole]))
     for j, (rows, _) in enumerate(things):
         others = [thing for k, thing in whole.items() if k != j and k not in found]
         reach = [(cKDTree(p.points).query(means[rows])[0], p.radius) for p in map(Points.of, others)]
         if all(np.quantile(away, ALONG[0]) > ALONG[1] * radius for away, radius in reach):
             continue
-        ids = np.full(len(grown), -1, np.int32)
-        ids[rows] = j
-        shown = visit.looks(grown, ids)
+        shown = visit.looks(grown, _numbered(len(grown), [things[j]]))
         without = Gaussians.concatenate([grown.rows(torch.from_numpy(np.setdiff1d(stays, rows))), *others])
         looks = visit.looks(without, np.full(len(without), -1, np.int32))
         looks = [replace(look, ids=with_it.ids) for look, with_it in zip(looks, shown, strict=True)]
-        (signs,) = signs_of(looks, [j], np.ones(1), np.full(1, np.inf))
+        (signs,) = signs_of(looks, [0], np.ones(1), np.full(1, np.inf))
         if signs.photos and signs.alike > 0:
             found.add(j)
     return found
 
 
+def _added(
+    gmap: Map, things: list[Thing], known: set[int], taken: set[int], looked: list[float]
+) -> dict[int, tuple[int, New]]:
+    """By its new id: the number of each thing that is none of the `taken`, and how it is new. looked [T]: the share of
+    each thing's place at which earlier photos looked."""
+    numbers = [j for j, (_, score) in enumerate(things) if j not in taken and score >= LEAST_SCORE]
+
+    def how(j: int) -> New:
+        hidden = bool(gmap.views) and looked[j] < LOOKED_AT
+        return "known" if j in known else "hidden" if hidden else "added"
+
+    return {i: (j, how(j)) for i, j in enumerate(numbers, gmap.next_id)}
+
+
 def _settled(
     visit: Visit,
-    grown: Gaussians,
+    owned: Owned,
     kept: np.ndarray,
-    ids: np.ndarray,
-    made: Grouping,
-    free: np.ndarray,
-    signs: list[Signs],
+    leaves: np.ndarray,
+    new: np.ndarray,
+    pairs: Pairs,
     gone: list[int],
-    things: list[tuple[np.ndarray, float]],
-    old: set[int],
-    pairs: dict[int, tuple[int, Motion]],
-    pieces: set[int],
-    record: TrainRecord,
-) -> Today:
-    """Puts the Gaussians of moved things where the new ones grew, leaves out `pieces` of them and new surface through
-    which earlier photos saw, unless it is of a thing, and trains the colours of all that was looked at."""
-    gmap, run = visit.gmap, visit.run
-    membership = np.concatenate([gmap.membership[kept], np.ones(len(grown) - len(kept), np.float32)])
-    membership[free] = np.where(made.ids >= 0, made.membership, 0)
-    parts = gmap.parts["ids"] if "ids" in gmap.parts else np.full(len(gmap), -1, np.int32)
-    part_ids = np.concatenate([parts[kept], np.full(len(grown) - len(kept), -1, np.int32)])
-    taken = {j for j, _ in pairs.values()} | pieces
-    following, added = gmap.next_id, dict[int, tuple[float, New]]()
-    fresh = np.arange(len(kept), len(grown))
-    looked, through = looked_at(as_gaussians(gmap), gmap.views, grown.means[fresh].double().numpy())
-    for j, (rows, score) in enumerate(things):
-        if j not in taken and score >= LEAST_SCORE:
-            hidden = bool(gmap.views) and looked[rows - len(kept)].mean() < LOOKED_AT
-            ids[rows], added[following] = following, (score, "known" if j in old else "hidden" if hidden else "added")
-            following += 1
-    own = np.isin(fresh, _rows(things, set(range(len(things)))))  # other new surface stands where nothing did: an error
-    stays = np.setdiff1d(np.arange(len(grown)), np.append(_rows(things, taken), fresh[through & ~own]))
-    came = [np.isin(stays, fresh[own])]
-    placed, names, members, owned = (
-        [grown.rows(torch.from_numpy(stays))],
-        [ids[stays]],
-        [membership[stays]],
-        [part_ids[stays]],
-    )
+    alone: bool,
+) -> tuple[Owned, np.ndarray, TrainRecord]:
+    """All Gaussians of today and the rows of the map that the first ones are: what no photo may show, what stays of
+    `owned`, whose first rows are the rows `kept` [H] of the map, without the rows `leaves`, and the moved things with
+    their own Gaussians. The colours of all that was looked at are trained. new: rows of the new things; alone: whether
+    this is the only training."""
+    gmap = visit.gmap
+    stays = np.setdiff1d(np.arange(len(owned.gaussians)), leaves)
+    parts = [owned.rows(stays)]
     hues = [visit.hues(gaussians_of(gmap, kept)), torch.zeros(len(stays) - len(kept), 3)]
     for i, (_, motion) in pairs.items():
-        own = visit.rows_of(i)
-        hues.append(visit.hues(visit.own(i)))
-        placed.append(carried(visit.thing(i), motion.new_from_old))
-        names.append(np.full(len(placed[-1]), i, np.int32))
-        came.append(np.ones(len(placed[-1]), bool))
-        back = i in visit.away  # without rows in the map
-        members.append(np.ones(len(names[-1]), np.float32) if back else gmap.membership[own])
-        owned.append(np.full(len(names[-1]), -1, np.int32) if back else parts[own])
-    together = Gaussians.concatenate(placed)
-    config = update_config(run.config, len(visit.photos.views), SETTLING, len(together), alone=not record.iterations)
-    start = together.sh.clone()
-    new = together.rows(torch.from_numpy(np.flatnonzero(np.concatenate(came))))
-    others = Gaussians.concatenate([visit.part(np.isin(visit.ids, gone)), new])
-    memory = visit.rehearsed(visit.part(np.isin(visit.rows, kept)), others)
-    final, last = trained(
-        run, "settle", visit.mark, visit.masks["identity"], together, len(together), visit.photos, memory, config
-    )
-    unseen = (final.sh[: len(kept)] == start[: len(kept)]).flatten(1).all(dim=1)
+        own = visit.own(i)
+        parts.append(replace(own, gaussians=carried(visit.seen(own.gaussians), motion.new_from_old)))
+        hues.append(visit.hues(own.gaussians))
+    today = Owned.concatenate(parts)
+    together = today.gaussians
+    start = together.sh[: len(kept)].clone()
+    came = np.append(np.isin(stays, new), np.ones(len(together) - len(stays), bool))
+    others = [visit.part(np.isin(visit.ids, gone)), together.rows(torch.from_numpy(np.flatnonzero(came)))]
+    memory = visit.rehearsed(visit.part(np.isin(visit.rows, kept)), Gaussians.concatenate(others))
+    final, record = trained(visit, "settle", SETTLING, together, len(together), memory, alone)
+    unseen = (final.sh[: len(kept)] == start).flatten(1).all(dim=1)
     final = in_grey(final) if visit.grey else final
     final.sh[:, 0] += torch.cat(hues)
     original = torch.from_numpy(gmap.sh[kept])
     final.sh[: len(kept)] = torch.where(unseen[:, None, None], original, final.sh[: len(kept)])
     rest = np.setdiff1d(np.flatnonzero(~np.isin(gmap.instance_ids, gone)), visit.rows)  # no photo may show these
-    together = Gaussians.concatenate([gaussians_of(gmap, rest), final])
-    names, members, owned = [gmap.instance_ids[rest], *names], [gmap.membership[rest], *members], [parts[rest], *owned]
-    arrays = (np.concatenate(names).astype(np.int32), np.concatenate(members), np.concatenate(owned).astype(np.int32))
-    motions = {i: motion for i, (_, motion) in pairs.items()}
-    record = TrainRecord.joined([record, last], "leg")
-    return Today(together, np.concatenate([rest, kept]), *arrays, signs, gone, motions, added, record)
+    return Owned.concatenate([visit.owned(rest), replace(today, gaussians=final)]), np.append(rest, kept), record

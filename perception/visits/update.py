@@ -50,7 +50,7 @@ from perception.visits.record import (
     with_parts,
 )
 from perception.visits.today import Today, seen_today
-from perception.visits.visit import TENSORS, Visit, open_visit
+from perception.visits.visit import Visit, open_visit
 
 
 def update_map(
@@ -102,16 +102,16 @@ def _refuse_other_masks(gmap: Map, name: str) -> None:
 def _encoder_of(gmap: Map, spec: str) -> Encoder | None:
     """The encoder `spec` of the settings, which describes what is new; None for instances that none describes.
     InputError unless it is the one that described the map's."""
-    from perception.language.description import check_encoder
     from perception.language.encoders import make_encoder
 
+    if gmap.instances and not gmap.language and spec == gmap.setting("language", "encoder", "auto"):
+        return None
     encoder = make_encoder(spec)
-    if gmap.language and encoder is not None:
-        check_encoder(str(gmap.language["encoder"]), encoder.identity)
-    elif gmap.language or (gmap.instances and spec != gmap.setting("language", "encoder", "auto")):
-        what = f"the instances of {gmap.path} are described by {gmap.language.get('encoder', 'none')}"
-        raise InputError(f"language.encoder: found {spec}, but {what}; leave it out")
-    return encoder if gmap.language or not gmap.instances else None
+    before, now = str(gmap.language.get("encoder", "none")), "none" if encoder is None else encoder.identity
+    if gmap.instances and before != now:
+        todo = "leave it out" if "none" in (before, now) else "give the first, or run: perception upgrade MAP"
+        raise InputError(f"language.encoder: that of {gmap.path} is {before}, that of the visit {now}; {todo}")
+    return encoder
 
 
 # ----------------------------------------------------------------------- record
@@ -119,33 +119,28 @@ def _encoder_of(gmap: Map, spec: str) -> Encoder | None:
 
 def _described(visit: Visit, today: Today, encoder: Encoder | None) -> DescribedInstances:
     """Entries and embeddings of the added instances, in their order."""
-    ids = np.full(len(today.ids), -1, np.int32)
-    for n, i in enumerate(today.added):
-        ids[today.ids == i] = n
-    none = np.full(len(ids), -1, np.int32)
-    grouping = Grouping(
-        ids,
-        today.membership,
-        np.array([score for score, _ in today.added.values()]),
-        none,
-        groups=np.full(len(today.added), -1, np.int32),
-    )
-    optimised = Optimised(Nearby(today.gaussians), visit.photos, today.record, visit.masks)
-    reader = make_reader(visit.run.config.language.texts) if today.added else None
+    owned, added = today.owned, today.added
+    ids, none = np.full((2, len(owned.ids)), -1, np.int32)
+    for n, i in enumerate(added):
+        ids[owned.ids == i] = n
+    scores, groups = np.array([score for score, _ in added.values()]), np.full(len(added), -1, np.int32)
+    grouping = Grouping(ids, owned.membership, scores, none, groups=groups)
+    optimised = Optimised(Nearby(owned.gaussians), visit.photos, today.record, visit.masks)
+    reader = make_reader(visit.run.config.language.texts) if added else None
     with visit.run.stage("instances"):
-        return describe(optimised, grouping, visit.run, encoder if today.added else None, reader)
+        return describe(optimised, grouping, visit.run, encoder if added else None, reader)
 
 
 def assembled(visit: Visit, today: Today, described: DescribedInstances, output: Path, mark: str) -> Map:
     """The map of today."""
     gmap, run, number, prefix = visit.gmap, visit.run, visit.number, _prefix(visit)
-    gaussians = today.gaussians
+    owned, gaussians = today.owned, today.owned.gaussians
     instances = []
     for entry, signs in zip(gmap.instances, today.signs, strict=True):
-        motion, rows = today.motions.get(entry["id"]), np.flatnonzero(today.ids == entry["id"])
+        motion, rows = today.motions.get(entry["id"]), np.flatnonzero(owned.ids == entry["id"])
         entry = recorded(entry, number, signs, motion, entry["id"] in today.gone)
         if not is_removed(entry) and (motion is not None or len(rows) != entry["num_gaussians"]):
-            entry = with_parts(with_geometry(entry, gaussians, rows), gaussians, today.part_ids)
+            entry = with_parts(with_geometry(entry, gaussians, rows), gaussians, owned.part_ids)
         instances.append(entry)
     for i, entry in zip(today.added, described.instances, strict=True):
         new = today.added[i][1]
@@ -156,7 +151,7 @@ def assembled(visit: Visit, today: Today, described: DescribedInstances, output:
     with run.stage("score"):
         quality = score_views(in_grey(gaussians) if visit.grey else gaussians, visit.photos.held, gmap.metric)
         quality["views"] = {prefix + name: figures for name, figures in quality["views"].items()}
-    arrays = {name: getattr(gaussians, name).numpy() for name in TENSORS}
+    arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in gaussians.named().items()}
     fresh = slice(len(today.kept), None)
     norm = np.linalg.norm(arrays["quats"][fresh], axis=1, keepdims=True)
     arrays["quats"][fresh] = arrays["quats"][fresh] / np.maximum(norm, 1e-12)
@@ -179,13 +174,13 @@ def assembled(visit: Visit, today: Today, described: DescribedInstances, output:
     info["scene"] = {**scene, "left_out": [*scene.get("left_out", []), *left_out]}
     return Map(
         **arrays,
-        instance_ids=today.ids,
-        membership=today.membership,
+        instance_ids=owned.ids,
+        membership=owned.membership,
         instances=finite(instances),
         info=finite(info),
         views=views,
         language=joined_language(gmap.language, language),
-        parts=kept_parts(gmap.parts, today.part_ids, instances),
+        parts=kept_parts(gmap.parts, owned.part_ids, instances),
         groups=groups,
         past=past_with(gmap, today.gone, number - 1, visit.light),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from perception.gaussians.model import Gaussians
+from perception.gaussians.model import STORED, Gaussians
 from perception.gaussians.photos import split_scene
 from perception.gaussians.views import TrainingView
 from perception.map.history import is_removed, stood
@@ -39,23 +40,41 @@ from perception.visits.registration import compact
 from perception.visits.rehearsal import rehearsed, showing
 from perception.visits.scene import foreign_photos, refuse_older, visit_scene
 
-TENSORS = ("means", "quats", "log_scales", "opacity_logits", "sh", "features")
-"""Of `Gaussians`, and fields of a map."""
-
 
 def gaussians_of(gmap: Map, rows: np.ndarray) -> Gaussians:
     """The Gaussians `rows` [R] of a map."""
-    return Gaussians(**{name: torch.from_numpy(getattr(gmap, name)[rows]) for name in TENSORS})
+    return Gaussians(**{name: torch.from_numpy(getattr(gmap, name)[rows]) for name in STORED.values()})
+
+
+@dataclass
+class Owned:
+    """N Gaussians with the instance that each belongs to, ids [N] int32, −1 = none, how surely, membership [N] float32,
+    and the part of it, part_ids [N] int32."""
+
+    gaussians: Gaussians
+    ids: np.ndarray
+    membership: np.ndarray
+    part_ids: np.ndarray
+
+    def rows(self, index: np.ndarray) -> Owned:
+        """Copies of the rows `index` [M] int64."""
+        arrays = self.ids[index], self.membership[index], self.part_ids[index]
+        return Owned(self.gaussians.rows(torch.from_numpy(index)), *arrays)
+
+    @staticmethod
+    def concatenate(parts: Sequence[Owned]) -> Owned:
+        """All rows of `parts`, in order."""
+        arrays = zip(*((part.ids, part.membership, part.part_ids) for part in parts), strict=True)
+        return Owned(Gaussians.concatenate([part.gaussians for part in parts]), *map(np.concatenate, arrays))
 
 
 @dataclass
 class Visit:
     """The photos of a visit against the map. number: of the visit; rows [R]: of the map's Gaussians, those that a photo
-    may show; gaussians: these as the visit sees them (`seen`), with instances ids [R]; light [3]: its colours over the
-    map's; grey: whether brightness alone is compared, as either the photos or the map have no colours; photos: exposed
-    and labelled; stereo: depths of the training photos; earlier: views of
-    earlier visits that show what these see; masks: report; mark: of its training; left_out: names of photos
-    that are not used, and why."""
+    may show; gaussians: these as the visit sees them (`seen`); light [3]: its colours over the map's; grey: whether
+    brightness alone is compared, as the photos or the map have no colours; photos: exposed and labelled; stereo: depths
+    of the training photos; earlier: views of earlier visits that show what these see; masks: report; mark: of its
+    training; left_out: names of photos that are not used, and why."""
 
     run: Run
     gmap: Map
@@ -84,15 +103,20 @@ class Visit:
         """Renders of what earlier visits saw, as many as there are photos, see `rehearsal.rehearsed`."""
         return rehearsed(self.earlier, self.run.config.photos.max_side, len(self.photos.views), stays, others)
 
-    def rows_of(self, instance: int) -> np.ndarray:
-        """[R] rows of the map's Gaussians of an instance that are no strays."""
-        rows = np.flatnonzero(self.gmap.instance_ids == instance)
-        return rows[compact(self.gmap.means[rows].astype(np.float64))]
+    def owned(self, rows: np.ndarray) -> Owned:
+        """The rows [R] of the map, as it has them."""
+        gmap, none = self.gmap, np.full(len(rows), -1, np.int32)
+        parts = gmap.parts["ids"][rows] if "ids" in gmap.parts else none
+        return Owned(gaussians_of(gmap, rows), gmap.instance_ids[rows], gmap.membership[rows], parts)
 
-    def own(self, instance: int) -> Gaussians:
-        """These Gaussians as the map has them; of a removed instance as it was."""
-        known = self.away.get(instance)
-        return gaussians_of(self.gmap, self.rows_of(instance)) if known is None else known
+    def own(self, instance: int) -> Owned:
+        """The Gaussians of an instance that are no strays, as the map has them; of a removed one as it was."""
+        if instance in self.away:
+            count = len(self.away[instance])
+            ids, none = np.full(count, instance, np.int32), np.full(count, -1, np.int32)
+            return Owned(self.away[instance], ids, np.ones(count, np.float32), none)
+        rows = np.flatnonzero(self.gmap.instance_ids == instance)
+        return self.owned(rows[compact(self.gmap.means[rows].astype(np.float64))])
 
     def seen(self, gaussians: Gaussians) -> Gaussians:
         """Gaussians of the map in the light of the visit, without colours if it is compared in grey."""
@@ -104,7 +128,7 @@ class Visit:
 
     def thing(self, instance: int) -> Gaussians:
         """The Gaussians of an instance as the visit sees them."""
-        return self.seen(self.own(instance))
+        return self.seen(self.own(instance).gaussians)
 
     @cached_property
     def away(self) -> dict[int, Gaussians]:
@@ -178,20 +202,14 @@ def _told(run: Run, left_out: Sequence[dict[str, str]]) -> list[dict[str, str]]:
 
 
 def _exposed(old: Gaussians, photos: Photos) -> tuple[Photos, np.ndarray]:
-    """The photos with their gains; those held out as their neighbours."""
+    """The photos with their gains; those held out as the two nearest by name."""
     views, light = with_exposure(old, photos.views)
-    held = []
+    names, held = [view.name for view in views], []
     for view in photos.held:
-        near = sorted(views, key=lambda other: abs(_number(view.name, other.name, views)))[:2]
-        gains = [other.gain for other in near if other.gain is not None]
+        near = max(min(bisect(names, view.name) - 1, len(views) - 2), 0)
+        gains = [other.gain for other in views[near : near + 2] if other.gain is not None]
         held.append(replace(view, gain=torch.stack(gains).log().mean(dim=0).exp() if gains else None))
     return replace(photos, views=views, held=held), light
-
-
-def _number(name: str, other: str, views: Sequence[Any]) -> int:
-    """Photos between two names, in the order of names."""
-    names = sorted({view.name for view in views} | {name})
-    return names.index(other) - names.index(name)
 
 
 def _of_this_place(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -23,11 +23,12 @@ from perception.pipeline.checkpoint import digest, fingerprint
 from perception.pipeline.optimise import Photos, Run
 from perception.types import View
 from perception.visits.colours import without_colours
-from perception.visits.growth import GROWING, SETTLING, trained, update_config
+from perception.visits.growth import GROWING, LEAST_ITERATIONS, SETTLING, trained, update_config
 from perception.visits.look import Look
 from perception.visits.record import joined_language, visit_record
 from perception.visits.scene import foreign_photos, refuse_older, update_settings
 from perception.visits.update import _encoder_of, renamed, update_map
+from perception.visits.visit import Visit
 from support.progress import Told
 from support.visited_map import number, write_visited_map
 
@@ -152,7 +153,7 @@ def test_what_is_new_is_described_by_the_encoder_of_the_map(monkeypatch: pytest.
     assert _encoder_of(a_map(False, "none"), "none") is _encoder_of(a_map(False, "conse"), "conse") is None
     assert _encoder_of(a_map(False, "conse", 0), "conse") is known["conse"]
     for described, spec in ((True, "none"), (True, "clip:other"), (False, "conse")):
-        with pytest.raises(InputError, match=r"encoder.*; (leave it out|query with the first)"):
+        with pytest.raises(InputError, match=r"encoder.*; (leave it out|give the first)"):
             _encoder_of(a_map(described, "conse" if described else "none"), spec)
 
 
@@ -175,17 +176,18 @@ def test_a_leg_goes_on_only_from_the_gaussians_that_it_began_with(tmp_path: Path
     picture = torch.from_numpy(rng.integers(0, 255, (16, 24, 3)).astype(np.uint8))
     K = torch.tensor([[20.0, 0, 12], [0, 20, 8], [0, 0, 1]])
     view = TrainingView("a", picture, None, K, torch.eye(4))
-    config, told = load_config(pairs=["train.iterations=20", "train.budget=50", "train.exchange_db=0"]), Told()
+    config, told = load_config(pairs=["train.iterations=20", "train.exchange_db=0"]), Told()
     run, photos = Run.begun(tmp_path, config, tmp_path, told), Photos([], [], [view], [])
 
     def settled(count: int) -> Gaussians:
         points = np.random.default_rng(1).uniform([-1, -1, 3], [1, 1, 5], (count, 3))
         held = from_points(points, np.full((count, 3), 90, np.uint8), feature_dim=2, seed=0)
-        return trained(run, "settle", "mark", "masks", held, count, photos, [], config)[0]
+        visit = cast(Visit, SimpleNamespace(run=run, photos=photos, mark="mark"))
+        return trained(visit, "settle", SETTLING, held, count, [])[0]
 
     first = settled(30)
     assert len(settled(40)) == 40 and not told.lines  # with the checkpoint of 30
-    assert torch.equal(settled(30).sh, first.sh) and told.lines == ["resuming at iteration 20"]
+    assert torch.equal(settled(30).sh, first.sh) and told.lines == [f"resuming at iteration {LEAST_ITERATIONS}"]
 
 
 def test_a_finished_update_is_that_of_the_same_photos_and_the_same_map(tmp_path: Path) -> None:
