@@ -77,6 +77,11 @@ def stereo_of(
             stereo.preferred = np.where(unlike > 0, np.float32(0), stereo.prior)
         made.append(stereo)
     measure_depths([view for view in made if view is not None], progress)
+    for stereo, shown in zip(made, looks, strict=True):
+        if stereo is not None and shown.view.depth is not None:  # where the sensor measured nothing, it is the map's
+            known = shown.view.depth.numpy() > 0
+            known = cv2.resize(known.astype(np.uint8), stereo.depth.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+            stereo.confirmed = stereo.confirmed & known
     return made
 
 

@@ -14,7 +14,7 @@ from PIL import Image
 from perception.gaussians.model import Gaussians, isotropic
 from perception.gaussians.views import TrainingView, render
 from perception.pipeline.optimise import Photos
-from perception.types import View
+from perception.types import DepthImage, View
 from perception.visits.colours import grey_photo, in_grey
 from perception.visits.look import Look, depth_at, moments, stereo_of
 from perception.visits.visit import _of_this_place
@@ -69,6 +69,25 @@ def test_a_plain_new_thing_is_not_drawn_to_the_surface_behind_it() -> None:
         assert stereo is not None
         off = np.abs(depth_at(stereo, (H, W), confirmed=False) / depth - 1) < 0.03
         assert off[depth == BOX].mean() > 0.9 and off[depth == WALL].mean() > 0.95
+
+
+def test_nothing_is_measured_where_the_sensor_measured_nothing() -> None:
+    """There the map's depth only fills the image: it is no sign that the box, which the map shows, still stands."""
+    rng = np.random.default_rng(0)
+    wall, box = texture(rng, 0.12), texture(rng, 0.01) + 0.3
+    shots = [shot(f"{n}.jpg", x, wall, box) for n, x in enumerate(np.linspace(-0.4, 0.4, 5))]
+    views, photos, looks, exact = zip(*shots, strict=True)
+    depths = [torch.from_numpy(np.where(depth == BOX, 0, depth).astype(np.float32)) for depth in exact]
+    measured = [replace(view, depth=DepthImage(Path("depth.png"), 1.0)) for view in views]
+    mapped = [
+        replace(each, mapped=depth.astype(np.float32), view=replace(each.view, depth=sensor))
+        for each, depth, sensor in zip(looks, exact, depths, strict=True)
+    ]
+    for stereo, depth in zip(stereo_of(measured, photos, mapped), exact, strict=True):
+        found = depth_at(stereo, (H, W))
+        assert not found[depth == BOX].any()
+        assert (found[depth == WALL] > 0).mean() > 0.5  # what two other photos see
+        assert np.abs(found[found > 0] / WALL - 1).max() < 0.03
 
 
 def test_the_map_in_grey_is_the_grey_of_its_render() -> None:
