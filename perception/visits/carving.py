@@ -78,9 +78,7 @@ def carved_surface(looks: Sequence[Look], changed: Sequence[np.ndarray], known: 
 
 def _photo(look: Look, changed: np.ndarray) -> _Photo:
     colors = cv2.GaussianBlur(look.view.photo.numpy().astype(np.float32) / 255, (0, 0), BLUR)
-    counts = look.mapped > 0
-    if look.view.weight is not None:
-        counts &= look.view.weight.numpy() > 0
+    counts = (look.mapped > 0) & look.counts
     centre = inverse_se3(look.view.camera[1])[:3, 3]
     return _Photo(look, counts, changed & counts, np.asarray(colors), centre)
 

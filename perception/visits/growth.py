@@ -38,14 +38,15 @@ SPARE = 3
 
 
 def changed_pixels(shown: Look) -> np.ndarray:
-    """[h, w] bool: pixels whose surface the map lacks: where it shows none, and where the masks that it does not
-    explain have another depth or colour than it."""
+    """[h, w] bool: pixels that are not ignored whose surface the map lacks: where it shows none, and where the masks
+    that it does not explain have another depth or colour than it."""
     changed = shown.mapped == 0
     foreign = mask_odds(shown)[0] < 0
-    off = np.abs(shown.measured / np.maximum(shown.mapped, 1e-6) - 1) > SHIFTED
+    apart = np.abs(shown.measured / np.maximum(shown.mapped, 1e-6) - 1)
     local = shown.product < 0.3 * np.sqrt(np.maximum(shown.rendered * shown.shown, 0))
-    unlike = (shown.colour > DIFFERENT) & local & (np.abs(shown.measured / np.maximum(shown.mapped, 1e-6) - 1) > AGREE)
-    return np.asarray(changed | (foreign[shown.labels] & (off | (shown.colour > DIFFERENT))) | unlike)
+    other = shown.colour > DIFFERENT
+    changed |= (foreign[shown.labels] & ((apart > SHIFTED) | other)) | (other & local & (apart > AGREE))
+    return changed & shown.counts
 
 
 def new_surface(looks: Sequence[Look], like: Gaussians, budget: int, seed: int) -> Gaussians:

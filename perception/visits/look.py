@@ -45,6 +45,12 @@ class Look:
     colour: np.ndarray
 
     @property
+    def counts(self) -> np.ndarray:
+        """[h, w] bool: pixels that are not ignored."""
+        weight = self.view.weight
+        return np.ones(self.mapped.shape, bool) if weight is None else weight.numpy() > 0
+
+    @property
     def labels(self) -> np.ndarray:
         """[h, w] int64 masks of the photo, 0 = none."""
         height, width = self.mapped.shape

@@ -164,9 +164,10 @@ def foreign_photos(source: Path, gmap: Map, looks: Sequence[Look]) -> list[str]:
         raise InputError(f"{source}: is in another unit: {what}; give depth and poses in the map's unit")
     foreign = []
     for shown in looks:
-        mapped = shown.mapped > 0
+        counts = shown.counts
+        mapped = (shown.mapped > 0) & counts
         sums = [float(image[mapped].sum()) for image in (shown.product, shown.rendered, shown.shown)]
-        if mapped.mean() < LEAST_MAPPED or correlation(*sums) < LEAST_ALIKE:
+        if mapped.sum() < LEAST_MAPPED * counts.sum() or correlation(*sums) < LEAST_ALIKE:
             foreign.append(shown.view.name)
     if len(foreign) > (1 - LEAST_SHARE) * len(looks):
         many = f"{len(foreign)} of {len(looks)} photos do not show what {gmap.path} holds there (first: {foreign[0]})"

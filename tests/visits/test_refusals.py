@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -23,7 +24,7 @@ from perception.pipeline.checkpoint import digest, fingerprint
 from perception.pipeline.optimise import Photos, Run
 from perception.types import View
 from perception.visits.colours import without_colours
-from perception.visits.growth import GROWING, LEAST_ITERATIONS, SETTLING, trained, update_config
+from perception.visits.growth import GROWING, LEAST_ITERATIONS, SETTLING, changed_pixels, trained, update_config
 from perception.visits.look import Look
 from perception.visits.record import joined_language, visit_record
 from perception.visits.scene import foreign_photos, refuse_older, update_settings
@@ -89,6 +90,24 @@ def test_depth_in_another_unit_is_refused(tmp_path: Path) -> None:
     assert foreign_photos(tmp_path, a_map([]), [look(1.0)]) == []
     with pytest.raises(InputError, match="another unit: its depth images measure 1e"):
         foreign_photos(tmp_path, a_map([]), [look(1000.0)])
+
+
+def test_ignored_pixels_say_nothing_of_the_place_and_start_nothing(tmp_path: Path) -> None:
+    """A person fills most of each photo, before what the map shows, and is ignored."""
+    rng, nothing = np.random.default_rng(0), np.zeros((20, 30))
+    person = np.arange(30) < 24
+    product, variance = np.where(person, -0.5, 0.9) * np.ones((20, 1)), rng.uniform(0.99, 1, (20, 30))
+    measured, colour = np.where(person, 1.0, 2.0) * np.ones((20, 1)), np.where(person, 0.5, 0.0) * np.ones((20, 1))
+    for weight, here in ((None, False), (torch.from_numpy(np.where(person, 0, 1) * np.ones((20, 1))), True)):
+        view = TrainingView("a", torch.zeros(20, 30, 3, dtype=torch.uint8), None, torch.eye(3), torch.eye(4))
+        view = replace(view, weight=weight)
+        shown = Look(view, np.full((20, 30), 2.0), measured, nothing - 1, product, variance, variance, colour)
+        assert changed_pixels(shown).any() is np.bool_(not here)
+        if here:
+            assert foreign_photos(tmp_path, a_map([]), [shown]) == []
+        else:
+            with pytest.raises(InputError, match="1 of 1 photos do not show"):
+                foreign_photos(tmp_path, a_map([]), [shown])
 
 
 def test_a_setting_without_effect_is_refused(tmp_path: Path) -> None:
