@@ -103,7 +103,7 @@ def seen_today(visit: Visit) -> Today:
     start = np.count_nonzero(stays)
     fresh = np.arange(start, len(grown))
     looked, through = looked_at(as_gaussians(gmap), gmap.views, grown.means[fresh].double().numpy())
-    added = _added(gmap, things, known, taken, [looked[rows - start].mean() for rows, _ in things])
+    added = _added(gmap, things, known, taken, np.append(np.ones(start, bool), looked))
     for i, (j, _) in added.items():
         owned.ids[things[j][0]] = i
     own = np.isin(fresh, _rows(things))
@@ -272,7 +272,7 @@ def _pieces(visit: Visit, grown: Gaussians, things: list[Thing], whole: dict[int
     for j, (rows, _) in enumerate(things):
         others = [thing for k, thing in whole.items() if k != j and k not in found]
         reach = [(cKDTree(p.points).query(means[rows])[0], p.radius) for p in map(Points.of, others)]
-        if all(np.quantile(away, ALONG[0]) > ALONG[1] * radius for away, radius in reach):
+        if not len(rows) or all(np.quantile(away, ALONG[0]) > ALONG[1] * radius for away, radius in reach):
             continue
         shown = visit.looks(grown, _numbered(len(grown), [things[j]]))
         without = Gaussians.concatenate([grown.rows(torch.from_numpy(np.setdiff1d(stays, rows))), *others])
@@ -285,14 +285,14 @@ def _pieces(visit: Visit, grown: Gaussians, things: list[Thing], whole: dict[int
 
 
 def _added(
-    gmap: Map, things: list[Thing], known: set[int], taken: set[int], looked: list[float]
+    gmap: Map, things: list[Thing], known: set[int], taken: set[int], looked: np.ndarray
 ) -> dict[int, tuple[int, New]]:
-    """By its new id: the number of each thing that is none of the `taken`, and how it is new. looked [T]: the share of
-    each thing's place at which earlier photos looked."""
+    """By its new id: the number of each thing that is none of the `taken`, and how it is new. looked [N] bool: of all
+    Gaussians, those at whose place earlier photos looked."""
     numbers = [j for j, (_, score) in enumerate(things) if j not in taken and score >= LEAST_SCORE]
 
     def how(j: int) -> New:
-        hidden = bool(gmap.views) and looked[j] < LOOKED_AT
+        hidden = bool(gmap.views) and looked[things[j][0]].mean() < LOOKED_AT
         return "known" if j in known else "hidden" if hidden else "added"
 
     return {i: (j, how(j)) for i, j in enumerate(numbers, gmap.next_id)}

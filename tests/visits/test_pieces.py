@@ -17,7 +17,7 @@ from perception.masks.votes import MaskVotes
 from perception.visits.evidence import signs_from
 from perception.visits.growth import grouped
 from perception.visits.look import Look, look
-from perception.visits.today import _gone, _pieces
+from perception.visits.today import _apart, _gone, _pieces
 from perception.visits.visit import Visit
 from support.aimed import look_at
 
@@ -79,6 +79,16 @@ def test_two_new_things_are_two_whatever_method_made_the_map(preset: str) -> Non
     votes = MaskVotes(csr_matrix(pixels), csr_matrix((800, 6), dtype=np.float32), *masks)
     found = grouped(things, votes, np.arange(800), load_config(preset=preset))
     assert found.count == 2 and [np.unique(half).size for half in np.split(found.ids, 2)] == [1, 1]
+
+
+def test_a_thing_that_moved_away_from_all_that_it_was_known_by_leaves_that_apart() -> None:
+    """Photos may draw a motion beyond the new thing that it began at; no Gaussian is left at its number then."""
+    far = block((0.7, 0.7, 0), (0.9, 0.9, 0.3), 3)
+    grown = Gaussians.concatenate([CHAIR, BOX])
+    things, whole = [(np.arange(400), 0.9), (np.arange(400, 800), 0.8)], {0: CHAIR, 1: far}
+    apart = _apart(things, grown.means.double().numpy(), whole, 32)
+    assert [len(rows) for rows, _ in apart] == [400, 0, 400] and apart[2][1] == 0.8
+    assert _pieces(visit_of(grown), grown, apart, whole) == set()
 
 
 @pytest.mark.parametrize("seen_through", [400, 390])
