@@ -5,7 +5,6 @@ A task has a folder with a part of the photos or pairs, and leaves a COLMAP data
 
 from __future__ import annotations
 
-import os
 import sqlite3
 from collections.abc import Sequence
 from contextlib import closing
@@ -149,7 +148,7 @@ def write_part(
     target.unlink(missing_ok=True)
     load_pycolmap().Database.open(target).close()  # creates its tables
     with closing(sqlite3.connect(target)) as part, part:
-        part.execute("ATTACH DATABASE ? AS source", (os.fsencode(database),))
+        part.execute("ATTACH DATABASE ? AS source", (bytes(database),))
         for table in _IMAGES:
             part.execute(f"INSERT INTO {table} SELECT * FROM source.{table}")
         part.execute("CREATE TEMP TABLE wanted (id INTEGER PRIMARY KEY)")

@@ -92,9 +92,8 @@ def _map(store: FeatureStore, chosen: PhotoSet, folder: Path, options: ReadOptio
             best, steps = Escalation(best, groups, fixed, options).run()
         if not best.models or not best.models[0].num_points3D():  # all of a plane's may be filtered out
             advice = "take sharp, overlapping photos of a textured scene from different positions"
-            registered = len(best.registered) or "none"
-            found = ", in a model without points" if best.models else ""
-            raise InputError(f"{folder}: {registered} of the {count} photos could be registered{found}; {advice}")
+            found = f"{len(best.registered) or 'none'} of the {count} photos could be registered"
+            raise InputError(f"{folder}: {found}{', in a model without points' if best.models else ''}; {advice}")
         seconds |= {step["step"]: step["seconds"] for step in steps[1:]}
         report = _report(best, chosen.names, seconds) | ({"steps": steps} if steps else {})
         with atomic_directory(done) as new:
