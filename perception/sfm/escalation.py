@@ -20,22 +20,14 @@ import numpy as np
 from perception.geometry import align_similarity
 from perception.io.atomic import atomic_directory, recover
 from perception.photos.lens import load_pycolmap
-from perception.sfm import merge
+from perception.sfm import incremental, merge
 from perception.sfm.alternatives import settled
 from perception.sfm.appearance import likeness, looks_better
 from perception.sfm.consistency import consistent_photos, fold_warnings, stronger_contradictions, verified_pairs
 from perception.sfm.database import FeatureStore, delete_pairs, verified_matches
 from perception.sfm.feature_tasks import write_part
 from perception.sfm.features import FEW_FEATURES, THOROUGH, Group, extract, match
-from perception.sfm.incremental import (
-    MIN_MODEL_SIZE,
-    REPEATABLE_PHOTOS,
-    Mapped,
-    candidates,
-    map_photos,
-    pipeline_options,
-    take_out,
-)
+from perception.sfm.incremental import MIN_MODEL_SIZE, map_photos, pipeline_options, take_out
 from perception.sfm.options import ReadOptions
 from perception.sfm.pairs import largest_features, similar_photos
 
@@ -99,7 +91,7 @@ class Escalation:
 
     def run(self) -> tuple[Candidate, list[dict[str, Any]]]:
         """The best candidate; of each step its name, the photos registered after it, and seconds."""
-        names, few = self.best.store.names, len(self.best.store.names) <= REPEATABLE_PHOTOS
+        names, few = self.best.store.names, len(self.best.store.names) <= incremental.REPEATABLE_PHOTOS
         steps: list[dict[str, Any]] = [{"step": "at once", "registered": len(self.best.registered)}]
         tries = {"more features": self._grow}
         tries |= {"mapping anew": self._anew, "comparing photos": self._compare} if few else {}
@@ -168,7 +160,8 @@ class Escalation:
 
     def _anew(self, store: FeatureStore) -> Candidate | None:
         found = []
-        for models, out in candidates(store, self.fixed, self.options.seed, self.options.progress, most=CANDIDATES):
+        seed, progress = self.options.seed, self.options.progress
+        for models, out in incremental.candidates(store, self.fixed, seed, progress, most=CANDIDATES):
             whole = load_pycolmap().Reconstruction(models[0])
             found.append(self._checked(models, out, store))
             if len(found[-1].registered) >= whole.num_reg_images() and not found[-1].folded:
@@ -263,7 +256,7 @@ class Escalation:
         """`start` with photos added, checked."""
         return self._checked(*self._mapped(start, store), store, again, joined)
 
-    def _mapped(self, start: Any, store: FeatureStore) -> Mapped:
+    def _mapped(self, start: Any, store: FeatureStore) -> incremental.Mapped:
         """`start` with photos added."""
         seed, count, progress = self.options.seed, len(store.names), self.options.progress
         return map_photos(store, self.fixed, seed, count, progress, one_thread=True, start=start)

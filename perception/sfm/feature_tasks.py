@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from perception.io.atomic import atomic_directory
 from perception.machine import cores
@@ -65,7 +64,8 @@ class FeatureTasks:
                     own_id = {image: next(ids) for image in _images(theirs).values()}
                     for table in _FEATURES:
                         for image, *row in theirs.execute(f"SELECT * FROM {table}"):
-                            _insert(own, table, (own_id[image], *row))
+                            values = ", ".join("?" * (1 + len(row)))
+                            own.execute(f"INSERT INTO {table} VALUES ({values})", (own_id[image], *row))
 
     def match(self, database: Path, chosen: Sequence[tuple[str, str]], seed: int) -> None:
         """Adds the matches of the chosen pairs to a database with features; here by a process for each core."""
@@ -92,12 +92,12 @@ class FeatureTasks:
             results = [folder / RESULT for folder in folders]
         else:
             results = run_tasks(self.engine, match_task, folders, "pair set", self.progress)
-        with closing(sqlite3.connect(database)) as own, own:
+        with closing(sqlite3.connect(database, isolation_level=None)) as own:  # ATTACH is none of a transaction
             for result in results:
-                with closing(sqlite3.connect(result / DATABASE)) as theirs:
-                    for table in _MATCHES:
-                        for row in theirs.execute(f"SELECT * FROM {table}"):
-                            _insert(own, table, row)
+                own.execute("ATTACH DATABASE ? AS source", (str(result / DATABASE),))
+                for table in _MATCHES:
+                    own.execute(f"INSERT INTO {table} SELECT * FROM source.{table}")
+                own.execute("DETACH DATABASE source")
 
 
 def extract_task(task: str, progress: Progress = QUIET) -> None:
@@ -124,20 +124,15 @@ def match_task(task: str, progress: Progress = QUIET) -> None:
         with closing(sqlite3.connect(source)) as given, closing(sqlite3.connect(new / DATABASE)) as copy:
             given.backup(copy)
         match(new / DATABASE, facts["pairs"], facts["seed"], progress)
-        with closing(sqlite3.connect(new / DATABASE)) as copy:
-            with copy:
-                for table in _FEATURES:  # 0.3 MB a photo, in the copy of every task
-                    copy.execute(f"DELETE FROM {table}")
+        with closing(sqlite3.connect(new / DATABASE, isolation_level=None)) as copy:
+            for table in _FEATURES:  # 0.3 MB a photo, in the copy of every task
+                copy.execute(f"DELETE FROM {table}")
             copy.execute("VACUUM")
 
 
 def _images(database: sqlite3.Connection) -> dict[str, int]:
     """Ids of the images by name, in the order of their names, which are numbers of photos."""
     return dict(database.execute("SELECT name, image_id FROM images ORDER BY name"))
-
-
-def _insert(database: sqlite3.Connection, table: str, row: Sequence[Any]) -> None:
-    database.execute(f"INSERT INTO {table} VALUES ({', '.join('?' * len(row))})", row)
 
 
 def write_part(

@@ -39,14 +39,15 @@ def match_errors(features: Features, poses: Poses) -> tuple[np.ndarray, np.ndarr
     """Pixel errors of the matches in both directions, [2M] each: distance from the epipolar line; and from the feature
     that is carried over by its measured depth, NaN without depth."""
     lines, carried = [], []
+    rays = np.c_[features.rays, np.ones(len(features.rays))]
     for a, b in (features.pairs.T, features.pairs.T[::-1]):
         first, second = features.view[a], features.view[b]
         b_from_world = poses.rotation[second]
-        ray = np.einsum("mij,mkj,mk->mi", b_from_world, poses.rotation[first], _rays(features, a))
+        ray = np.einsum("mij,mkj,mk->mi", b_from_world, poses.rotation[first], rays[a])
         origin = np.einsum("mij,mj->mi", b_from_world, poses.center[first] - poses.center[second])
         line = np.cross(origin, ray)
         norm = np.maximum(np.linalg.norm(line[:, :2], axis=1), 1e-300)
-        lines.append(features.focal[b] * np.abs((line * _rays(features, b)).sum(1)) / norm)
+        lines.append(features.focal[b] * np.abs((line * rays[b]).sum(1)) / norm)
         x = origin + ray * features.depth[a][:, None]
         z = np.where((features.depth[a] > 0) & (x[:, 2] > 0), x[:, 2], np.nan)
         carried.append(features.focal[b] * np.linalg.norm(x[:, :2] / z[:, None] - features.rays[b], axis=1))
@@ -169,7 +170,3 @@ def _changes(delta: np.ndarray) -> tuple[dict[str, Any], str]:
     text = f"cameras moved {moved['median']:.3g} units in the median, at most {moved['max']:.3g}, "
     text += f"and turned {turned['median']:.2g}°, at most {turned['max']:.2g}°"
     return {"moved": moved, "turned_deg": turned}, text
-
-
-def _rays(features: Features, of: np.ndarray) -> np.ndarray:
-    return np.concatenate([features.rays[of], np.ones((len(of), 1))], axis=1)

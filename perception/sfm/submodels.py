@@ -12,24 +12,16 @@ from pathlib import Path
 
 from perception.io.atomic import atomic_directory
 from perception.progress import QUIET, Progress
-from perception.sfm import merge, partition
+from perception.sfm import incremental, merge, partition
 from perception.sfm.consistency import is_contradicted, outvoted_photos, verified_pairs
 from perception.sfm.database import FeatureStore, verified_matches
 from perception.sfm.feature_tasks import write_part
-from perception.sfm.incremental import (
-    MIN_MODEL_SIZE,
-    Mapped,
-    map_photos,
-    pipeline_options,
-    read_models,
-    take_out,
-    write_models,
-)
+from perception.sfm.incremental import map_photos, pipeline_options, take_out
 from perception.sfm.options import ReadOptions
 from perception.tasks.folder import RESULT, has_task, read_facts, run_tasks, write_task
 
 
-def map_submodels(store: FeatureStore, fixed: bool, options: ReadOptions) -> Mapped | None:
+def map_submodels(store: FeatureStore, fixed: bool, options: ReadOptions) -> incremental.Mapped | None:
     """As `map_photos`, by submodels; None where the photos' matches contradict the merged model."""
     counts = {pair: len(matches) for pair, matches in verified_matches(store.database).items() if len(matches)}
     if not counts:
@@ -38,7 +30,7 @@ def map_submodels(store: FeatureStore, fixed: bool, options: ReadOptions) -> Map
     submodels = partition.with_overlap(partition.divide(counts, partition.LARGEST), counts)
     folders = [_task(store, images, number, fixed, seed) for number, images in enumerate(submodels)]
     results = run_tasks(options.engine, submodel_task, folders, "poses: submodel", progress, each_core=True)
-    models = [model for result in results for model in read_models(result)]
+    models = [model for result in results for model in incremental.read_models(result)]
     groups = merge.align(merge.without_repeats(models), seed)
     if not groups:
         return None
@@ -53,7 +45,7 @@ def map_submodels(store: FeatureStore, fixed: bool, options: ReadOptions) -> Map
     wrong = outvoted_photos(pairs)
     left_out = {best.images[image].name for image in wrong}
     had = set(best.reg_image_ids())  # photos of the others may have been added
-    others = [model for model in others if len(set(model.reg_image_ids()) - had) >= MIN_MODEL_SIZE]
+    others = [model for model in others if len(set(model.reg_image_ids()) - had) >= incremental.MIN_MODEL_SIZE]
     take_out(best, wrong)
     shutil.rmtree(store.folder / "submodels")
     return [best, *others], left_out
@@ -77,4 +69,4 @@ def submodel_task(task: str, progress: Progress = QUIET) -> None:
     store = FeatureStore(folder, Path(facts["photos"]), [], {})
     models, _ = map_photos(store, facts["fixed"], facts["seed"], facts["count"], progress, one_thread=True)
     with atomic_directory(folder / RESULT) as new:
-        write_models(models, new)
+        incremental.write_models(models, new)

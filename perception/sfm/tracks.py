@@ -116,8 +116,7 @@ def tracks_of_model(model: Any, views: list[View], names: dict[int, str], most: 
     for image_id, name in names.items():
         if name not in number:
             continue
-        image = model.images[image_id]
-        camera = model.cameras[image.camera_id]
+        image, camera = model.images[image_id], model.images[image_id].camera
         seen = [point for point in image.get_observation_points2D() if point.point3D_id in rank]
         found = np.array([point.xy for point in seen], np.float64).reshape(-1, 2)
         rays = np.asarray(camera.cam_from_img(found), np.float64).reshape(-1, 2)
