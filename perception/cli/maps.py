@@ -268,6 +268,8 @@ def _localise(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     if not any(photo["localised"] for photo in facts["photos"]):
         if args.json:
             print(json.dumps(facts, allow_nan=False))
-        first = facts["photos"][0]
-        raise InputError(f"{args.map}: none of {len(facts['photos'])} photos: {first['name']}: {first['why']}")
+        first, gone = facts["photos"][0], len(facts["rendered"])
+        found = f"none of {len(facts['photos'])} photos: {first['name']}: {first['why']}"
+        todo = f"; {gone} photos of the map are not at hand and were rendered: --photos DIR gives their folder"
+        raise InputError(f"{args.map}: {found}{todo if gone else ''}")
     return facts, "\n".join(lines)
