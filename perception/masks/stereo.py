@@ -149,7 +149,7 @@ def choose_neighbours(views: list[StereoView]) -> list[list[int]]:
         best_views: list[int] = []
         while len(best_views) < min(NEIGHBOURS, len(views) - 1):
             gain = np.maximum(useful, first) + np.clip(np.minimum(useful, first), second, None) - first - second
-            gain = gain.mean(axis=1)
+            gain = gain.sum(axis=1) / max(1, len(points))
             gain[best_views] = -1
             best = int(gain.argmax())
             if gain[best] < _LEAST_GAIN:

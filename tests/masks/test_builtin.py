@@ -29,6 +29,7 @@ from perception.masks.merging import (
 )
 from perception.masks.stereo import (
     StereoView,
+    choose_neighbours,
     confirmed,
     homographies,
     make_stereo_view,
@@ -189,6 +190,16 @@ def test_depths_confirm_each_other_only_where_they_agree():
     assert count.max() == 1 and count.mean() > 0.8
     np.testing.assert_allclose(mean[count == 1], depth[count == 1], rtol=0.031)
     assert confirmed(depth * 1.2, eyes[0], eyes[1:], [theirs])[0].mean() < 0.1
+
+
+def test_a_photo_of_which_no_point_of_the_grid_has_depth_is_matched_with_none():
+    """Lines of a laser may miss the grid; a photo was then matched with itself, which confirms every depth."""
+    views = true_views()[:4]
+    lines = np.zeros_like(views[0].prior)
+    lines[::16] = views[0].prior[::16]
+    assert (lines > 0).mean() > 0.05
+    first, *others = choose_neighbours([replace(views[0], prior=lines), *views[1:]])
+    assert first == [] and all(others)
 
 
 def test_planes_cover_the_depths_known():
