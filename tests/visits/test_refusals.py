@@ -154,6 +154,19 @@ def test_another_encoder_than_that_of_the_map_is_refused(tmp_path: Path, words: 
     assert sorted(file.name for file in tmp_path.iterdir()) == ["old.gsmap", "photos"]
 
 
+def test_settings_of_the_maps_own_input_are_none_of_its_visits(tmp_path: Path) -> None:
+    """Cameras of a finished splat may be gone: an update reads none of them."""
+    gmap = read_map(write_visited_map(tmp_path / "a.gsmap"))
+    own = {"splat": {"cameras": str(tmp_path / "gone"), "up": "z"}, "photos": {"camera": "gone.yaml", "max_side": 320}}
+    gmap.info["config"] = own
+    write_map(tmp_path / "b.gsmap", gmap)
+    (tmp_path / "photos").mkdir()
+    photo(tmp_path / "photos" / "a.jpg", None)
+    config = update_settings(tmp_path / "b.gsmap", None, [])
+    assert config.photos.max_side == 320 and config.splat == MapConfig().splat and config.photos.camera is None
+    assert inputs_of(tmp_path / "photos", config, tmp_path / "new.gsmap")
+
+
 def test_what_is_new_is_described_by_the_encoder_of_the_map(monkeypatch: pytest.MonkeyPatch) -> None:
     """Another one would be recorded, and prompts answered by that. A map without instances has none yet."""
     known = {
