@@ -1,9 +1,8 @@
 """The surface of new things that stereo does not measure, from their outlines in several photos.
 
-Stereo asks for two photos from similar directions. Of a dozen photos around a room few are, and a ball or a mug may
-have no measured pixel, though three photos show it. Along the rays of its mask in one photo, a point may be on it where
-the other photos that see so far show something new, too (space carving, Kutulakos & Seitz 2000), and its surface is
-where their colours agree best, if they do better than at the map's surface.
+Stereo asks for two photos from similar directions, of which a dozen photos around a room have few. Along the rays of a
+new thing's mask in one photo, a point may be on it where the other photos that see so far show something new, too
+(space carving, Kutulakos & Seitz 2000). Its surface is where their colours agree best, if better than at the map's.
 """
 
 from __future__ import annotations
@@ -31,12 +30,12 @@ searched; share of them that is covered by what other photos measured, from whic
 OTHERS = 16
 """Most other photos by which the rays of a mask are judged."""
 LEAST_SUPPORT, LEAST_ANGLE, AGAINST = 2, 10.0, 0.2
-"""Other photos that must show something new at a point, one of them from a direction so many degrees apart; share of
-those that see so far which may show what the map does: masks have errors."""
+"""Other photos that must show something new at a point, one of them so many degrees apart; share of those that see so
+far which may show what the map does, as masks have errors."""
 FOUND = 0.3
 """Share of the rays of a mask with such a point, below which it is an error or a shadow."""
 BLUR, UNLIKE = 1.5, 0.3
-"""Standard deviation in pixels of the window in which colours are compared; a difference counts up to UNLIKE, of 1."""
+"""Standard deviation in pixels of the window in which colours are compared; their largest difference that counts."""
 PER_AGAINST, PER_SUPPORT, MANY = 0.1, 0.02, 6
 """Difference of colour that all photos against a point are worth, and one that supports it, up to MANY."""
 FOOTPRINT = 2.0

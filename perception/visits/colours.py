@@ -20,15 +20,13 @@ COLOURLESS = 2.0
 BINS = 6
 """Of each colour in the histograms of things."""
 LOOKS = 8.0, 0.45
-"""Log-odds of being one thing per unit of what two histograms have in common, and where that says nothing: the same
-things share .5 to .75 between visits, others up to .5."""
+"""Log-odds of being one thing per unit of what two histograms have in common, and where that says nothing: of one thing
+in two visits .5 to .75, of others up to .5."""
 HUES = -35.0, 0.07
 """Log-odds of being one thing per unit of difference between the shares of red, green and blue in its colours and in
-the photos', and where that says nothing. Of pairs that were compared in made scenes, 134 of 142 right ones have
-positive log-odds, and 4 of 88 wrong ones that are no look-alikes."""
+the photos', and where that says nothing: positive for 134 of 142 right pairs of made scenes and 4 of 88 wrong ones."""
 GREY = -1.5
-"""The same without colours, where histograms of brightness say nothing: of 53 pairs compared in made scenes 16 of 26
-right ones are above, and 2 of 27 wrong ones."""
+"""The same without colours, where histograms say nothing: 16 of 26 right pairs and 2 of 27 wrong ones are above."""
 
 
 def in_light(gaussians: Gaussians, light: np.ndarray) -> Gaussians:
@@ -69,8 +67,8 @@ def looks_alike(old: Gaussians, new: Gaussians) -> float:
 
 def colour_odds(old: Gaussians, alike: float, sums: np.ndarray) -> float:
     """Log-odds that an old thing is the one that photos show, by what the histograms of their colours have in common,
-    `alike`, and by their hues: a mean over all pixels is known better than the colour of each, and brightness, which
-    light changes, is left out. sums [2, 3]: of the colours of the thing and of the photos over its pixels."""
+    `alike`, and by their hues, without brightness, which light changes. sums [2, 3]: of the colours of the thing and of
+    the photos over its pixels."""
     if (old.sh == old.sh[..., :1]).all():
         return GREY
     odds, totals = LOOKS[0] * (alike - LOOKS[1]), sums.sum(axis=1, keepdims=True)

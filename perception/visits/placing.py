@@ -25,9 +25,8 @@ from perception.types import View
 from perception.visits.look import compared
 
 OFF = 0.0025
-"""Median motion of corners between photo and render, as a share of the width, above which poses are wrong: of made
-visits with true poses, where things moved and light changed, up to .0017; of a real kitchen, whose recorded poses drift
-by 3 cm, .0124, and .001 after localisation."""
+"""Median motion of corners between photo and render, as a share of the width, above which poses are wrong: of true
+poses of made visits up to .0017; of a real kitchen, whose poses drift by 3 cm, .0124, and .001 once localised."""
 COMPARED = 12
 """Photos that are compared with the map."""
 LEAST_PLACED = 0.5

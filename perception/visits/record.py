@@ -54,8 +54,8 @@ def visit_record(source: Path, photos: Sequence[Path]) -> dict[str, Any]:
 
 def visits_with(gmap: Map, source: Path, photos: Sequence[Path]) -> list[dict[str, Any]]:
     """`visits` of map.json after this one."""
-    before = [visit.to_json() for visit in visits_of(gmap.info, len(gmap.views))]
-    old = [{key: visit[key] for key in ("time", "input", "photos")} for visit in before]
+    before = visits_of(gmap.info, len(gmap.views))
+    old = [{"time": visit.time, "input": visit.input, "photos": visit.photos} for visit in before]
     return [*old, visit_record(source, photos)]
 
 
@@ -76,20 +76,17 @@ def with_parts(entry: dict[str, Any], gaussians: Gaussians, part_ids: np.ndarray
 
 def recorded(entry: dict[str, Any], visit: int, signs: Signs, motion: Motion | None, gone: bool) -> dict[str, Any]:
     """The entry of an old instance after a visit, still with its old geometry. gone: it does not stand there."""
-    known = {"first_seen": 0, "last_seen": visit - 1, "last_looked_for": visit - 1}
-    entry = {**{key: entry.get(key, value) for key, value in known.items()}, **entry}
+    entry = {"first_seen": 0, "last_seen": visit - 1, "last_looked_for": visit - 1, **entry}
     if is_removed(entry):
         return entry if motion is None else returned(entry, visit, motion)
     if not signs.seen:
         return {**entry, "state": "unseen", "confidence": round(1 - 0.5 * min(1.0, signs.share / UNSEEN), 3)}
+    sure = probability(signs.log_odds)
     if not gone:
-        return {
-            **entry, "state": "unchanged", "confidence": round(probability(signs.log_odds), 3), "last_seen": visit,
-            "last_looked_for": visit,
-        }  # fmt: skip
-    stood = {"until": visit - 1, **{key: entry[key] for key in _GEOMETRY[1:] if key in entry}}
-    stood |= {"transform": None} if motion is None else _motion_record(motion)
-    past, sure = [*entry.get("past", ()), stood], 1 - probability(signs.log_odds)
+        state = {"state": "unchanged", "confidence": round(sure, 3)}
+        return {**entry, **state, "last_seen": visit, "last_looked_for": visit}
+    stood = {**_spot(entry, visit), **({"transform": None} if motion is None else _motion_record(motion))}
+    past, sure = [*entry.get("past", ()), stood], 1 - sure
     if motion is None:
         entry = {key: value for key, value in entry.items() if key != "parts"}
         entry |= {"state": "removed", "confidence": round(sure, 3), "num_gaussians": 0}
@@ -101,20 +98,22 @@ def recorded(entry: dict[str, Any], visit: int, signs: Signs, motion: Motion | N
 def returned(entry: dict[str, Any], visit: int, motion: Motion) -> dict[str, Any]:
     """The entry of a removed instance that a visit found again, still with its old geometry."""
     *before, left = entry["past"]
-    away = {"until": visit - 1, **{key: entry[key] for key in _GEOMETRY[1:] if key in entry}, "gone": True}
-    past = [*before, {**left, "transform": np.eye(4).tolist()}, {**away, **_motion_record(motion)}]
+    away = {**_spot(entry, visit), "gone": True, **_motion_record(motion)}
+    past = [*before, {**left, "transform": np.eye(4).tolist()}, away]
     state = {"state": "added", "confidence": round(probability(motion.odds), 3)}
     return {**entry, **state, "last_seen": visit, "last_looked_for": visit, "past": past}
 
 
+def _spot(entry: dict[str, Any], visit: int) -> dict[str, Any]:
+    """Of `past`: where an entry stood until the visit before `visit`."""
+    return {"until": visit - 1, **{key: entry[key] for key in _GEOMETRY[1:] if key in entry}}
+
+
 def _motion_record(motion: Motion) -> dict[str, Any]:
     """Keys of an entry of `past`."""
-    record: dict[str, Any] = {"transform": motion.new_from_old.tolist()}
-    if motion.ambiguous:
-        record["ambiguous"] = True
-    if motion.axis is not None:
-        record["axis"] = motion.axis.tolist()
-    return record
+    told = {"ambiguous": True} if motion.ambiguous else {}
+    axis = {} if motion.axis is None else {"axis": motion.axis.tolist()}
+    return {"transform": motion.new_from_old.tolist(), **told, **axis}
 
 
 def joined_language(old: dict[str, np.ndarray], new: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

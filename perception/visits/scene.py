@@ -68,15 +68,19 @@ def update_settings(path: Path, file: Path | None, pairs: list[str]) -> MapConfi
 
 
 def visit_scene(run: Run, gmap: Map, output: Path) -> Scene:
-    """The views of the visit, in the map's frame, one of each place: a robot that stands still takes many, and what one
-    shows by mistake all do. InputError where there are none, or most are of another scene."""
+    """The views of the visit, in the map's frame, one of each place: a robot that stands still takes many with the same
+    errors. InputError where there are none, or most are of another scene."""
     scene = _all_views(run, gmap, output)
-    points = gmap.means[:: max(1, len(gmap) // POINTS)].astype(np.float64)
-    views = without_doubles(scene.views, points)
+    views = without_doubles(scene.views, _some_points(gmap))
     if len(views) == len(scene.views):
         return scene
     note = f"{len(views)} of {len(scene.views)} photos are used, as the others were taken where one of these was"
     return replace(scene, views=views, report={**scene.report, "notes": [*scene.report.get("notes", []), note]})
+
+
+def _some_points(gmap: Map) -> np.ndarray:
+    """[P, 3] float64 points of the map, about POINTS."""
+    return gmap.means[:: max(1, len(gmap) // POINTS)].astype(np.float64)
 
 
 def without_doubles(views: Sequence[View], points: np.ndarray) -> list[View]:
@@ -99,25 +103,23 @@ def _all_views(run: Run, gmap: Map, output: Path) -> Scene:
     assert gmap.path is not None
     photos, source = run.config.photos, run.source
     camera, masks = (Path(file) if file else None for file in (photos.camera, photos.ignore_masks))
-    options = ReadOptions(run.work / "sfm", run.config.seed, run.progress, photos.strict, masks, camera)
-    options = replace(options, still=photos.ignore_still)
-    b_from_a = map_from_input(gmap.path, gmap.info)
-    some = move_points(np.linalg.inv(b_from_a), gmap.means[:: max(1, len(gmap) // POINTS)].astype(np.float64))
-    cloud = some, np.zeros((len(some), 3), np.uint8)
-    options = replace(options, frames=frames_folder(output), poses="keep", cloud=cloud)
+    map_from_source = map_from_input(gmap.path, gmap.info)
+    some = move_points(np.linalg.inv(map_from_source), _some_points(gmap))
+    folder, frames, seed = run.work / "sfm", frames_folder(output), run.config.seed
+    options = ReadOptions(folder, seed, run.progress, photos.strict, masks, camera, frames, poses="keep")
+    options = replace(options, cloud=(some, np.zeros((len(some), 3), np.uint8)), still=photos.ignore_still)
     if not reader_of(source).poses:
-        photos_of = source
         if source.suffix.lower() in VIDEO_SUFFIXES and source.is_file():
-            photos_of = frames_folder(output)
-            video_frames(source, photos_of, run.progress)
-        return with_checked_masks(_localised(run, gmap, photos_of, options), masks)
+            video_frames(source, frames, run.progress)
+            source = frames
+        return with_checked_masks(_localised(run, gmap, source, options), masks)
     scene = load_scene(source, options)
     if not scene.views:
         raise InputError(f"{source}: holds no posed photo; give photos of a new visit")
     listed = transforms_files(source) if scene.report.get("input") == "transforms" else []
     if listed and in_map_frame(listed[0], gmap.info, gmap.views):
         return scene
-    return replace(scene, views=[moved(view, b_from_a) for view in scene.views])
+    return replace(scene, views=[moved(view, map_from_source) for view in scene.views])
 
 
 def _localised(run: Run, gmap: Map, source: Path, options: ReadOptions) -> Scene:
@@ -135,11 +137,9 @@ def _localised(run: Run, gmap: Map, source: Path, options: ReadOptions) -> Scene
         first = f"first: {lost.name}: {lost.why}"
         many = f"{len(answers) - len(here)} of {len(answers)} photos are not in {gmap.path} ({first})"
         raise InputError(f"{run.source}: {many}; give photos of the mapped scene, or map this one anew")
-    views = [make_view(a.name, a.photo, a.lens, a.camera_from_map, a.photo) for a in here]
-    views = [replace(view, mask=answer.mask) for view, answer in zip(views, here, strict=True)]
+    views = [replace(make_view(a.name, a.photo, a.lens, a.camera_from_map, a.photo), mask=a.mask) for a in here]
     left = [{"name": a.name, "why": a.why} for a in answers if not isinstance(a, Localised)]
-    report = {"input": "photos", "left_out": left}
-    none = np.zeros((0, 3))
+    none, report = np.zeros((0, 3)), {"input": "photos", "left_out": left}
     return Scene(sorted(views, key=lambda v: v.name), none, none.astype(np.uint8), gmap.metric, gmap.frame, report)
 
 

@@ -1,12 +1,14 @@
 """`perception update`: a map of today from a map and a new visit.
 
-poses      of the visit in the map's frame, given or localised                        `scene`
-look       exposure of the visits, stereo depth, masks; the map beside the photos     `look`
-evidence   what still stands where it stood, what does not, what nobody looked at     `evidence`
-grow       new Gaussians where the photos show another surface, the rest held         `growth`
-motion     which new thing is which one that is gone, and how it moved                `motion`
-settle     colours of all that was looked at; a moved thing keeps its own Gaussians   `growth`
-record     states, confidences and past places of all instances                       `record`
+poses      of the photos in the map's frame, given or localised                           `scene`, `placing`
+look       exposure, stereo depth and masks of the photos; the map's render beside them   `visit`, `look`
+evidence   from both: what stands where it stood, what does not, what nobody looked at    `evidence`
+grow       from what stays: new Gaussians where the photos show another surface           `growth`, `carving`
+motion     from what grew: which new thing is which one that is gone, and how it moved    `motion`, `registration`
+settle     colours of all that was looked at; a moved thing keeps its own Gaussians       `growth`, `rehearsal`
+record     states, confidences and past places of all instances                           `record`
+
+`today` puts evidence to settle together.
 """
 
 from __future__ import annotations
@@ -114,9 +116,6 @@ def _encoder_of(gmap: Map, spec: str) -> Encoder | None:
     return encoder
 
 
-# ----------------------------------------------------------------------- record
-
-
 def _described(visit: Visit, today: Today, encoder: Encoder | None) -> DescribedInstances:
     """Entries and embeddings of the added instances, in their order."""
     owned, added = today.owned, today.added
@@ -133,57 +132,69 @@ def _described(visit: Visit, today: Today, encoder: Encoder | None) -> Described
 
 def assembled(visit: Visit, today: Today, described: DescribedInstances, output: Path, mark: str) -> Map:
     """The map of today."""
-    gmap, run, number, prefix = visit.gmap, visit.run, visit.number, _prefix(visit)
-    owned, gaussians = today.owned, today.owned.gaussians
-    instances = []
-    for entry, signs in zip(gmap.instances, today.signs, strict=True):
-        motion, rows = today.motions.get(entry["id"]), np.flatnonzero(owned.ids == entry["id"])
-        entry = recorded(entry, number, signs, motion, entry["id"] in today.gone)
-        if not is_removed(entry) and (motion is not None or len(rows) != entry["num_gaussians"]):
-            entry = with_parts(with_geometry(entry, gaussians, rows), gaussians, owned.part_ids)
-        instances.append(entry)
-    for i, entry in zip(today.added, described.instances, strict=True):
-        new = today.added[i][1]
-        seen = {"first_seen": 0 if new == "known" else number, "last_seen": number, "last_looked_for": number}
-        seen |= {"hidden_before": True} if new == "hidden" else {}
-        state = {"state": "added" if new == "added" else "unchanged", "confidence": round(entry["score"], 3)}
-        instances.append({**entry, "id": i, **state, **seen})
+    gmap, run, number, prefix, owned = visit.gmap, visit.run, visit.number, _prefix(visit), today.owned
+    instances = _entries(visit, today, described)
     with run.stage("score"):
-        quality = score_views(in_grey(gaussians) if visit.grey else gaussians, visit.photos.held, gmap.metric)
+        seen = in_grey(owned.gaussians) if visit.grey else owned.gaussians
+        quality = score_views(seen, visit.photos.held, gmap.metric)
         quality["views"] = {prefix + name: figures for name, figures in quality["views"].items()}
-    arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in gaussians.named().items()}
+    arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in owned.gaussians.named().items()}
     fresh = slice(len(today.kept), None)
     norm = np.linalg.norm(arrays["quats"][fresh], axis=1, keepdims=True)
     arrays["quats"][fresh] = arrays["quats"][fresh] / np.maximum(norm, 1e-12)
     groups = dict(gmap.groups)
     if groups:
         groups["of"] = np.append(groups["of"], np.full(len(today.added), -1)).astype(np.int32)
-    assert gmap.path is not None
-    old = [view for view in gmap.views if isinstance(view, StoredView)]
-    views = [*(moved_record(view, gmap.path, output) for view in old), *_views(visit, output, prefix)]
-    info = {**gmap.info, "visits": visits_with(gmap, run.source, [v.photo for v in views if v.visit == number])}
-    seconds = {**run.seconds, "total": time.monotonic() - run.started}
-    config, side = run.config.to_json(), gmap.setting("photos", "max_side", MAX_SIDE)
+    side = gmap.setting("photos", "max_side", MAX_SIDE)  # at which boxes of all views are
     language = renamed(described.language, prefix, visit.photos.training, run.config.photos.max_side, side)
-    config["photos"]["max_side"] = side  # at which boxes of all views are
-    info |= {"quality": quality, "config": config, "fingerprint": mark, "seconds": seconds}
-    info["instances"] = {**info.get("instances", {}), "count": len(instances)}
-    info["next_id"] = max([gmap.next_id, *(i + 1 for i in today.added)])
-    info |= {"training": asdict(today.record), "masks": visit.masks, "peak_memory_mib": peak_memory_mib()}
-    scene, left_out = info.get("scene", {}), [{**entry, "name": prefix + entry["name"]} for entry in visit.left_out]
-    info["scene"] = {**scene, "left_out": [*scene.get("left_out", []), *left_out]}
+    config = run.config.to_json()
+    config["photos"]["max_side"] = side
+    assert gmap.path is not None
+    old, new = [view for view in gmap.views if isinstance(view, StoredView)], _views(visit, output, prefix)
+    scene, left_out = gmap.info.get("scene", {}), [{**e, "name": prefix + e["name"]} for e in visit.left_out]
+    info = {
+        **gmap.info,
+        "visits": visits_with(gmap, run.source, [view.photo for view in new]),
+        "quality": quality,
+        "config": config,
+        "fingerprint": mark,
+        "seconds": {**run.seconds, "total": time.monotonic() - run.started},
+        "instances": {**gmap.info.get("instances", {}), "count": len(instances)},
+        "next_id": max([gmap.next_id, *(i + 1 for i in today.added)]),
+        "training": asdict(today.record),
+        "masks": visit.masks,
+        "peak_memory_mib": peak_memory_mib(),
+        "scene": {**scene, "left_out": [*scene.get("left_out", []), *left_out]},
+    }
     return Map(
         **arrays,
         instance_ids=owned.ids,
         membership=owned.membership,
         instances=finite(instances),
         info=finite(info),
-        views=views,
+        views=[*(moved_record(view, gmap.path, output) for view in old), *new],
         language=joined_language(gmap.language, language),
         parts=kept_parts(gmap.parts, owned.part_ids, instances),
         groups=groups,
         past=past_with(gmap, today.gone, number - 1, visit.light),
     )
+
+
+def _entries(visit: Visit, today: Today, described: DescribedInstances) -> list[dict[str, Any]]:
+    """The entries of the map's instances after the visit, then those of the new ones."""
+    number, owned, made = visit.number, today.owned, []
+    for entry, signs in zip(visit.gmap.instances, today.signs, strict=True):
+        motion, rows = today.motions.get(entry["id"]), np.flatnonzero(owned.ids == entry["id"])
+        entry = recorded(entry, number, signs, motion, entry["id"] in today.gone)
+        if not is_removed(entry) and (motion is not None or len(rows) != entry["num_gaussians"]):
+            entry = with_parts(with_geometry(entry, owned.gaussians, rows), owned.gaussians, owned.part_ids)
+        made.append(entry)
+    for (i, (_, new)), entry in zip(today.added.items(), described.instances, strict=True):
+        seen = {"first_seen": 0 if new == "known" else number, "last_seen": number, "last_looked_for": number}
+        seen |= {"hidden_before": True} if new == "hidden" else {}
+        state = {"state": "added" if new == "added" else "unchanged", "confidence": round(entry["score"], 3)}
+        made.append({**entry, "id": i, **state, **seen})
+    return made
 
 
 def _prefix(visit: Visit) -> str:
@@ -194,17 +205,14 @@ def _prefix(visit: Visit) -> str:
     return f"{prefix}/"
 
 
-def _views(visit: Visit, output: Path, prefix: str) -> list[Any]:
-    """The views of the visit as the map records them."""
+def _views(visit: Visit, output: Path, prefix: str) -> list[StoredView]:
+    """The views of the visit as the map records them, by name."""
     photos, made = visit.photos, []
-    decoded = {view.name: view for view in (*photos.views, *photos.held)}
-    held = {view.name for view in photos.held}
-    for view in sorted([*photos.training, *photos.held_out], key=lambda view: view.name):
-        gain = decoded[view.name].gain
-        view = replace(view, gain=None if gain is None else tuple(gain.double().tolist()))
-        record = stored_view(view, output, view.name in held, visit.number)
-        made.append(replace(record, name=prefix + view.name))
-    return made
+    for posed, decoded, held in ((photos.training, photos.views, False), (photos.held_out, photos.held, True)):
+        for view, gain in ((view, shown.gain) for view, shown in zip(posed, decoded, strict=True)):
+            view = replace(view, gain=None if gain is None else tuple(gain.double().tolist()))
+            made.append(replace(stored_view(view, output, held, visit.number), name=prefix + view.name))
+    return sorted(made, key=lambda view: view.name)
 
 
 def renamed(

@@ -133,9 +133,12 @@ class Visit:
     @cached_property
     def away(self) -> dict[int, Gaussians]:
         """The removed instances of which the map knows what they looked like, by id."""
-        removed = {entry["id"]: as_it_was(self.gmap, entry) for entry in self.gmap.instances if is_removed(entry)}
-        found = ((i, thing, compact(thing.means.double().numpy())) for i, thing in removed.items() if thing is not None)
-        return {i: thing.rows(torch.from_numpy(np.flatnonzero(kept))) for i, thing, kept in found}
+        found = {}
+        for entry in filter(is_removed, self.gmap.instances):
+            if (thing := as_it_was(self.gmap, entry)) is not None:
+                kept = np.flatnonzero(compact(thing.means.double().numpy()))
+                found[entry["id"]] = thing.rows(torch.from_numpy(kept))
+        return found
 
     def seen_from(self, instance: int) -> np.ndarray:
         """[V, 3] directions to an instance where it stands, or stood last, from the map's views of that time, see
@@ -145,7 +148,7 @@ class Visit:
         views = [view for view in self.gmap.views if stood(entry, getattr(view, "visit", 0)) is spot]
         return seen_from(views, self.thing(instance).means.double().numpy())
 
-    @property
+    @cached_property
     def frames(self) -> list[tuple[TrainingView, np.ndarray]]:
         """The training photos at the size at which they are compared, and what was measured in them."""
         pairs = zip(map(compared, self.photos.views), self.stereo, strict=True)
@@ -189,9 +192,10 @@ def open_visit(run: Run, gmap: Map, source: MaskSource, output: Path) -> Visit:
     photos, masks = label_photos(
         run, photos, source, lambda view: depth_at(depths[view.name], view.photo.shape, confirmed=False)
     )
-    number = len(gmap.info.get("visits") or [0])
     mark = digest(gmap.map_id, training_mark(run.source, run.config), source.identity)
-    return Visit(run, gmap, number, rows, lit, light, grey, photos, stereo, earlier, masks, mark, left_out)
+    return Visit(
+        run, gmap, gmap.newest_visit + 1, rows, lit, light, grey, photos, stereo, earlier, masks, mark, left_out
+    )
 
 
 def _told(run: Run, left_out: Sequence[dict[str, str]]) -> list[dict[str, str]]:
