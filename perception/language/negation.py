@@ -10,7 +10,7 @@ from perception.language.printed import quoted_text
 from perception.language.shape_words import head_noun
 
 _NOT = re.compile(
-    r"^(?:there (?:is|are) )?(?:no|without|nothing|none)(?![-\w])|\bno longer\b|\b(?:all|anything|everything) but\b"
+    r"^(?:there (?:is|are) )?(?:no|without|none)(?![-\w])|\bno longer\b|\b(?:all|anything|everything) but\b"
     r"|(?<![-\w])(?:not|neither|nor|never|except)(?![-\w])|n['’]t\b",
     re.IGNORECASE,
 )
