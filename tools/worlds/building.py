@@ -1,8 +1,11 @@
 """Writes a building: furnished rooms in a row, joined by openings in their walls, with exact truth.
 
 python tools worlds.building FOLDER [--rooms 6] [--photos 1200] [--size 480x360] [--seed 0]
+python tools worlds.building FOLDER --visit ROOM [--photos 60] [the same rooms, size, seed]
 
-The walk goes round each room and on through the opening. FOLDER then holds what tools/worlds/make.py writes.
+The walk goes round each room and on through the opening. FOLDER then holds what tools/worlds/make.py writes. --visit:
+FOLDER-visit then holds photos of one room (from 0) at a later time, with things moved, removed and added in it as
+`worlds.visits` does, and changes.json.
 """
 
 from __future__ import annotations
@@ -13,14 +16,18 @@ import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from perception.io.cloud import read_cloud, write_cloud
+from perception.types import PointCloud
 from support.aimed import look_at
-from worlds import room, scene
+from worlds import room, scene, visits
 from worlds.cameras import UP, Camera, intrinsics, walk
 from worlds.light import Body, Part, Scene, corners
 from worlds.shapes import Sheet, to_world
+from worlds.truth import DemoTruth, Truth
 
 VIEWS, FOCAL_35MM, POINTS = 1200, 26, 600_000
 OPENING, HIGH, CORNER = 0.95, 2.1, 0.12
@@ -43,22 +50,37 @@ def rooms(count: int, seed: int, light_samples: int) -> list[tuple[Scene, np.nda
 
 def build(seed: int, light_samples: int = 20, count: int = 6) -> Scene:
     """The building: all rooms side by side along x, with openings in the walls between them."""
-    made = rooms(count, seed, light_samples)
+    return _joined(rooms(count, seed, light_samples))[0]
+
+
+def _joined(
+    made: list[tuple[Scene, np.ndarray, float]], later: dict[int, Scene] | None = None
+) -> tuple[Scene, list[list[int]]]:
+    """The building of `rooms`, and of each room the ids of its bodies, 0 = left out. later: rooms as they are at a
+    later time, by number: what came is last of all, so that ids stay."""
     passages = []  # (x of the wall, y of the opening's middle)
     for (_, half, x), (_, beyond, _) in itertools.pairwise(made):
         passages.append((x + half[0], min(half[1], beyond[1]) - CORNER - OPENING / 2))
-    bodies: list[Body] = []
+    bodies, came, ids = list[Body](), list[Body](), list[list[int]]()
     for number, (alone, _, x) in enumerate(made):
-        doors = passages[max(number - 1, 0) : number + 1]
-        for body in alone.bodies:
-            moved = replace(body.placed(0, np.array([x, 0, 0])), on=None, hangs_on=None)
+        doors, own = passages[max(number - 1, 0) : number + 1], list[int]()
+        for before, body in itertools.zip_longest(alone.bodies, (later or {}).get(number, alone).bodies):
+            there, moved = (
+                each and replace(each.placed(0, np.array([x, 0, 0])), on=None, hangs_on=None) for each in (before, body)
+            )
+            if there is None:
+                came.append(moved)
+                continue
+            if not there.is_stuff and any(_stands_in(there, *door) for door in doors):
+                own.append(0)
+                continue
             if moved.kind == "wall":
                 moved = replace(moved, parts=[piece for part in moved.parts for piece in _opened(part, doors)])
-            elif not moved.is_stuff and any(_stands_in(moved, *door) for door in doors):
-                continue
             bodies.append(moved)
+            own.append(len(bodies))
+        ids.append(own)
     route = partial(_route, made=[(half, x) for _, half, x in made], passages=passages)
-    return Scene(bodies, made[0][0].lighting, route, [])
+    return Scene([*bodies, *came], made[0][0].lighting, route, []), ids
 
 
 def _opened(part: Part, doors: list[tuple[float, float]]) -> list[Part]:
@@ -150,11 +172,45 @@ def make_building(
     _sparse(folder)
 
 
+def make_visit(
+    folder: Path,
+    room: int,
+    count: int = 6,
+    photos: int = 60,
+    size: tuple[int, int] = (480, 360),
+    seed: int = 0,
+    rays: int = 12,
+) -> None:
+    """Writes a later visit of one room of a building beside it."""
+    made, rng = rooms(count, seed, rays), np.random.default_rng((seed, room, 7))
+    visit = visits.later(made[room][0], rng, visits.SHARE, rays)
+    building, ids = _joined(made, {room: visit.scene})
+    own, last = ids[room], max(map(max, ids))
+    came = range(last + 1, last + 1 + len(visit.scene.bodies) - len(own))
+    number = {of_room: i for of_room, i in enumerate([*own, *came], start=1) if i}
+    shift = np.eye(4)
+    shift[0, 3] = made[room][2]
+    states = dict.fromkeys((i for each in ids for i in each if i), "unchanged")
+    states |= {number[i]: state for i, state in visit.states.items() if i in number}
+    motions = {number[i]: shift @ each @ np.linalg.inv(shift) for i, each in visit.motions.items() if i in number}
+    cameras = visits.between(building.cameras(count * photos, *size)[room * photos : (room + 1) * photos], 1)
+    home = folder.with_name(f"{folder.name}-visit")
+    maker: Any = _Maker(count)
+    after, pictures = scene.photograph(building, maker, cameras, home / "images", home, seed + 1000)
+    facts = visits.changes(_truth(folder), after, visits.Visit(building, states, motions), pictures)
+    (home / "changes.json").write_text(json.dumps(facts, indent=1), encoding="utf-8")
+
+
+def _truth(folder: Path) -> DemoTruth:
+    """The instances and surface points of a building that was written."""
+    facts, cloud = json.loads((folder / "scene.json").read_text(encoding="utf-8")), read_cloud(folder / "gt_points.ply")
+    assert cloud.colors is not None and cloud.normals is not None
+    made = cloud.points, cloud.normals, cloud.colors, cloud.labels["instance_id"]
+    return DemoTruth([Truth(**entry) for entry in facts["instances"]], [], [], [], *made, folder)
+
+
 def _sparse(folder: Path) -> None:
     """points.ply: every 20th of the true surface points, as structure from motion would find them."""
-    from perception.io.cloud import read_cloud, write_cloud
-    from perception.types import PointCloud
-
     cloud = read_cloud(folder / "gt_points.ply")
     assert cloud.colors is not None
     write_cloud(folder / "points.ply", PointCloud(cloud.points[::20], cloud.colors[::20]))
@@ -164,9 +220,13 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     parser.add_argument("--rooms", type=int, default=6)
-    parser.add_argument("--photos", type=int, default=VIEWS)
+    parser.add_argument("--photos", type=int)
+    parser.add_argument("--visit", type=int, metavar="ROOM")
     parser.add_argument("--size", default="480x360")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     across, down = map(int, given.size.split("x"))
-    make_building(given.folder, given.rooms, given.photos, (across, down), given.seed)
+    if given.visit is None:
+        make_building(given.folder, given.rooms, given.photos or VIEWS, (across, down), given.seed)
+    else:
+        make_visit(given.folder, given.visit, given.rooms, given.photos or 60, (across, down), given.seed)

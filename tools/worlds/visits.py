@@ -219,7 +219,7 @@ def make_visits(
     for number in range(1, visits):
         visit = later(made, rng, SHARE if share is None else share, light_samples)
         made, home = visit.scene, folder / f"visit{number}"
-        path = _between(made.cameras(later_views or max(3, count // 2), width, height), number)
+        path = between(made.cameras(later_views or max(3, count // 2), width, height), number)
         truth, pictures = photograph(made, maker, path, home / "images", home, seed + 1000 * number)
         facts = changes(found[-1], truth, visit, pictures)
         (home / "changes.json").write_text(json.dumps(facts, indent=1), encoding="utf-8")
@@ -227,7 +227,7 @@ def make_visits(
     return found
 
 
-def _between(cameras: list[Camera], number: int) -> list[Camera]:
+def between(cameras: list[Camera], number: int) -> list[Camera]:
     """Cameras on another path: each moved towards the next one."""
     moved = []
     for n, camera in enumerate(cameras):
