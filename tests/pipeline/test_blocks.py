@@ -30,7 +30,7 @@ from perception.pipeline.mapping import build_map
 from perception.pipeline.optimise import Optimised, Photos, Run
 from perception.progress import QUIET
 from perception.tasks.engine import Engine
-from perception.tasks.folder import TASK, read_task, versions, write_task
+from perception.tasks.folder import TASK, read_task, renew_task, versions, write_task
 from perception.types import Scene, View
 from support.aimed import look_at
 from support.elsewhere import Elsewhere
@@ -366,9 +366,9 @@ def test_votes_and_silhouettes_of_other_machines_are_those_made_here(
 
     def noted(folder: Path, scene: Scene, **facts: Any) -> None:
         shown.append(facts["parts"])
-        write_task(folder, scene, **facts)
+        renew_task(folder, scene, **facts)
 
-    monkeypatch.setattr(photo_tasks, "write_task", noted)
+    monkeypatch.setattr(photo_tasks, "renew_task", noted)
     made = build_map(row, tmp_path / "m.gsmap", settings(row), engine=engine)
     sets = -(-sum(not view.held_out for view in whole.views) // 7)
     assert engine.asked[-2:] == [sets, sets] and len(shown) == 2 * sets
