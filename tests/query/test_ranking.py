@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import sys
 from collections.abc import Sequence
+from functools import cache
 from itertools import chain
 from typing import Any
 
@@ -37,6 +38,11 @@ from perception.language.shape_words import KINDS
 from perception.query.ranking import BESIDE, LAPSE, PRESENT, Answer, Ranker, answering, least_score, probes
 
 DIM = 24
+
+
+@cache
+def conse() -> ConseEncoder:
+    return ConseEncoder()
 
 
 def rank(prompt: str, things: list[InstanceDescription], encoder: Any, labels: Any = None) -> Answer:
@@ -151,7 +157,7 @@ def test_a_label_that_means_the_prompt_is_an_answer(scene: tuple[Table, list[Ins
 @pytest.mark.parametrize("label", ["Werkzeugwagen", "книга", "桌子", "K17"])
 @pytest.mark.parametrize("prompt", ["Schraubendreher", "ноутбук", "电视", "T800", "and"])
 def test_a_label_that_the_encoder_cannot_read_answers_to_itself_alone(label: str, prompt: str) -> None:
-    encoder = ConseEncoder()
+    encoder = conse()
     things = [unseen(encoder.dim)]
     assert not rank(prompt, things, encoder, labels=[label]).present  # another thing, in words that no list here holds
     assert rank(label, things, encoder, labels=[label]).hits == [(0, 1.0)]
@@ -159,7 +165,7 @@ def test_a_label_that_the_encoder_cannot_read_answers_to_itself_alone(label: str
 
 def test_a_prompt_of_which_the_encoder_knows_no_word_is_answered_by_print_and_names_alone() -> None:
     """Each thing, red, looks as the encoder takes one of the prompts to be."""
-    encoder, prompts = ConseEncoder(), ["🍌", "red 🍌", "καρέκλα", "কলা", "여우", "ＦＯＸ", "狐", "?", "..."]
+    encoder, prompts = conse(), ["🍌", "red 🍌", "καρέκλα", "কলা", "여우", "ＦＯＸ", "狐", "?", "..."]
     things = [_thing(row, (200, 25, 30)) for row in encoder.encode_texts(prompts)]
     print_of_3 = Printed([[{"text": "КОФЕ", "score": 1.0}] if n == 3 else [] for n in range(len(things))])
     plain, named = Ranker(things, encoder), Ranker(things, encoder, ["🦊", "αλεπού", "শিয়াল", *prompts[:6]])
@@ -172,7 +178,7 @@ def test_a_prompt_of_which_the_encoder_knows_no_word_is_answered_by_print_and_na
 
 @pytest.mark.parametrize(("label", "prompt"), [("red mug", "cup"), ("armchair", "chair"), ("fridge", "refrigerator")])
 def test_a_label_in_words_that_the_encoder_knows_answers_to_others_for_it(label: str, prompt: str) -> None:
-    assert rank(prompt, [unseen(ConseEncoder.dim)], ConseEncoder(), labels=[label]).present
+    assert rank(prompt, [unseen(ConseEncoder.dim)], conse(), labels=[label]).present
 
 
 def test_labels_are_compared_without_regard_to_capitals_and_to_how_accents_are_written(
