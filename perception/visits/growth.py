@@ -95,8 +95,10 @@ def trained(
     instances, or more time for the leg before, give others. On the CPU. share, alone: see `update_config`."""
     run, photos = visit.run, visit.photos
     config = update_config(run.config, len(photos.views), share, held + SPARE * (len(gaussians) - held), alone)
-    start = hashlib.sha256(b"".join(tensor.numpy().tobytes() for tensor in gaussians.named().values())).hexdigest()
-    work = run.work / f"leg-{leg}-{start[:16]}"
+    start = hashlib.sha256()
+    for tensor in gaussians.named().values():
+        start.update(tensor.contiguous().numpy().data)
+    work = run.work / f"leg-{leg}-{start.hexdigest()[:16]}"
     work.mkdir(exist_ok=True)
     trainer = Trainer(gaussians, [*photos.views, *rehearsed], config, photos.held, run.device, held=held)
     trainer.stopping.degree_decided = True  # the map's
