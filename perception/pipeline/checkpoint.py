@@ -103,7 +103,7 @@ class TrainingObserver:
                 except (KeyError, TypeError) as error:  # fields that are others
                     found = f"is of another version ({brief(error)})"
                     raise InputError(f"{self.work / name}: {found}; delete {self.work} to start over") from error
-                self.entered = state["masks"] is not None  # also where more time takes progress back before that
+                self.entered = state["masks"] is not None  # a longer time limit lowers the progress; the masks stay
                 self.progress.log(f"resuming at iteration {trainer.iteration}")
                 break
             self.progress.log(f"{self.work / name}: was trained on other masks, which enter again")
