@@ -232,7 +232,7 @@ class Escalation:
 
     def _join(self, store: FeatureStore) -> Candidate | None:
         """One model of those that share photos."""
-        groups = merge.align(merge.without_repeats(self.known), self.options.seed)
+        groups = merge.align(merge.without_repeats([self.known]), self.options.seed)
         return self._grown(self._adjusted(groups[0], store), store) if groups and len(groups[0]) > 1 else None
 
     def _global(self, store: FeatureStore) -> Candidate | None:

@@ -27,15 +27,22 @@ TOLERANCE, DIRECT = 1e-6, 20_000
 so 1e-5 is too early), and photos up to which its normal equations are solved by factorisation, which is then faster."""
 
 
-def without_repeats(models: Sequence[Any]) -> list[Any]:
-    """The models, largest first, with at least MIN_MODEL_SIZE photos that no larger one has. Small ones that repeat
-    photos of others are what did not fit into their submodel."""
+def without_repeats(found: Sequence[Sequence[Any]]) -> list[Any]:
+    """The models of submodels, `found` in each, largest first: the largest of each submodel, by which its neighbours
+    may be joined, and others with at least MIN_MODEL_SIZE photos that no larger one has. Small ones that repeat photos
+    of others are what did not fit into their submodel."""
     kept, had = [], set[int]()
-    for model in sorted(models, key=lambda model: (-model.num_reg_images(), sorted(model.reg_image_ids()))):
-        if len(new := set(model.reg_image_ids()) - had) >= MIN_MODEL_SIZE:
+    main = {id(max(models, key=_rank)) for models in found if models}
+    for model in sorted((model for models in found for model in models), key=_rank, reverse=True):
+        if id(model) in main or len(set(model.reg_image_ids()) - had) >= MIN_MODEL_SIZE:
             kept.append(model)
-            had |= new
+            had |= set(model.reg_image_ids())
     return kept
+
+
+def _rank(model: Any) -> tuple[int, list[int]]:
+    """Orders models by their number of photos, equal ones by the ids of these, the first ones higher."""
+    return model.num_reg_images(), [-image for image in sorted(model.reg_image_ids())]
 
 
 def align(models: Sequence[Any], seed: int) -> list[list[Any]]:

@@ -30,8 +30,8 @@ def map_submodels(store: FeatureStore, fixed: bool, options: ReadOptions) -> inc
     submodels = partition.with_overlap(partition.divide(counts, partition.LARGEST), counts)
     folders = [_task(store, images, number, fixed, seed) for number, images in enumerate(submodels)]
     results = run_tasks(options.engine, submodel_task, folders, "poses: submodel", progress, each_core=True)
-    models = [model for result in results for model in incremental.read_models(result)]
-    groups = merge.align(merge.without_repeats(models), seed)
+    found = [incremental.read_models(result) for result in results]
+    groups = merge.align(merge.without_repeats(found), seed)
     if not groups:
         return None
     progress.update("poses: adjusting", 0, 1)

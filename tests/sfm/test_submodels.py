@@ -170,7 +170,26 @@ def test_photos_without_a_submodel_are_added_and_small_repeated_models_are_not_u
     assert whole is not None and whole.num_reg_images() == PHOTOS
     small = pycolmap.Reconstruction(whole)
     submodels.take_out(small, set(sorted(small.reg_image_ids())[10:]))
-    assert merge.without_repeats([small, whole]) == [whole]
+    assert merge.without_repeats([[small, whole]]) == [whole]
+
+
+class Photos:
+    """A model of which only the photos are known."""
+
+    def __init__(self, *images: int) -> None:
+        self.images = images
+
+    def num_reg_images(self) -> int:
+        return len(self.images)
+
+    def reg_image_ids(self) -> tuple[int, ...]:
+        return self.images
+
+
+def test_a_submodel_between_two_that_have_all_its_photos_stays_as_it_joins_them() -> None:
+    first, second = Photos(*range(60)), Photos(*range(62, 120))
+    between, repeated = Photos(*range(45, 75)), Photos(50, 51, 52, 53)
+    assert merge.without_repeats([[first], [repeated, between], [second]]) == [first, second, between]
 
 
 @pytest.mark.slow
