@@ -23,6 +23,7 @@ LAYERS = """
     onnx photos
     tasks
     sfm
+    posed
     inputs map
     calibration bags frame
     rasterizer masks

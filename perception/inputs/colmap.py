@@ -15,9 +15,9 @@ from perception.photos.folder import folders_below, list_photos
 from perception.photos.lens import lens_from_camera
 from perception.photos.named_files import NamedFiles, parts_of
 from perception.photos.views import first_of, without_far
+from perception.posed.triangulate import MIN_POINTS, posed_scene
 from perception.sfm.model import cloud_of, views_of_model
 from perception.sfm.options import ReadOptions
-from perception.sfm.triangulate import MIN_POINTS, posed_scene
 from perception.types import Lens, Scene
 
 DEPTH = 3

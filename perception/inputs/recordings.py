@@ -17,9 +17,9 @@ from perception.photos.depth import read_depth
 from perception.photos.ignore_masks import mask_of
 from perception.photos.video import MOST_FRAMES, Chooser
 from perception.photos.views import first_of, posed_view, rigid_pose, without_far
+from perception.posed.triangulate import posed_scene
 from perception.progress import Progress
 from perception.sfm.options import NO_CLOUD, ReadOptions
-from perception.sfm.triangulate import posed_scene
 from perception.types import DepthImage, Lens, Scene, View
 
 LOOKED_AT = 10

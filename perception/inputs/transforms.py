@@ -23,8 +23,8 @@ from perception.photos.lens import FISHEYE, PERSPECTIVE, camera_from_lens, openc
 from perception.photos.named_files import NamedFiles
 from perception.photos.view_json import absolute, refuse_other_frame
 from perception.photos.views import first_of, posed_view, rigid_pose, without_far
+from perception.posed.triangulate import posed_scene
 from perception.sfm.options import NO_CLOUD, ReadOptions
-from perception.sfm.triangulate import posed_scene
 from perception.types import DepthImage, Lens, Scene, View
 
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")

@@ -10,9 +10,9 @@ import numpy as np
 from perception.geometry import camera_centres
 from perception.localise.keypoints import Described, triangulated
 from perception.localise.reference import Reference
-from perception.sfm.bundle_adjustment import Adjusted, Poses, adjust, residuals
+from perception.posed.bundle_adjustment import Adjusted, Poses, adjust, residuals
+from perception.posed.pose_refinement import match_errors
 from perception.sfm.consistency import Pair, stronger_contradictions
-from perception.sfm.pose_refinement import match_errors
 from perception.sfm.tracks import Features, grouped, observed
 
 ROUNDS = 2

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perception.sfm.bundle_adjustment import Poses, residuals, starting_points
+from perception.posed.bundle_adjustment import Poses, residuals, starting_points
 from perception.sfm.database import FeatureStore
 from perception.sfm.pairs import COARSE_FEATURES, mutual_matches, stored_features, unit
 from perception.sfm.tracks import Features, Tracks, observed

@@ -16,11 +16,11 @@ from perception.machine import refuse_full_disk
 from perception.map.map import MAX_SIDE, Map
 from perception.photos.decode import scaled_K, scaled_size, why_left_out
 from perception.photos.views import view_lens
+from perception.posed.bundle_adjustment import Poses
+from perception.posed.pose_refinement import agreeing, poses_of
 from perception.progress import Progress
-from perception.sfm.bundle_adjustment import Poses
 from perception.sfm.database import build_features
 from perception.sfm.options import ReadOptions
-from perception.sfm.pose_refinement import agreeing, poses_of
 from perception.sfm.tracks import features_of, grouped
 from perception.types import View
 

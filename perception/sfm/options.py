@@ -26,7 +26,7 @@ class ReadOptions:
     ROS camera_info with the intrinsics of all photos, for photos, videos and recordings. frames: folder for the frames
     of a video (None: workdir/frames), which the map needs later. init_points: cloud in the frame of the input's poses,
     used instead of sparse points. poses: "keep", "refine", or "auto": checked where features are matched anyway or
-    views have depth, and refined where they are wrong (see sfm.pose_refinement). engine: where features are made.
+    views have depth, and refined where they are wrong (see posed.pose_refinement). engine: where features are made.
     still: what stays in the picture while the camera moves is ignored (see `photos.still`).
     lens, cloud: what `load_scene` reads from `camera` and `init_points`, if these are given.
     """

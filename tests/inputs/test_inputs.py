@@ -20,8 +20,9 @@ from perception.photos.camera_file import read_camera
 from perception.photos.decode import load_photo, read_photo, scaled_K, warp_labels
 from perception.photos.lens import camera_from_lens, load_pycolmap, pinhole_from_lens
 from perception.photos.views import make_view
+from perception.posed import triangulate
 from perception.progress import Progress
-from perception.sfm import pairs, triangulate
+from perception.sfm import pairs
 from perception.sfm.options import ReadOptions
 from perception.types import Lens, Scene, View
 from support.aimed import look_at

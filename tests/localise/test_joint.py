@@ -10,8 +10,8 @@ from perception.localise.joint import Adjustment, contradicted
 from perception.localise.keypoints import Described
 from perception.localise.pose import Matched, Pose
 from perception.localise.reference import Reference
-from perception.sfm.bundle_adjustment import Poses
-from perception.sfm.pose_refinement import poses_of
+from perception.posed.bundle_adjustment import Poses
+from perception.posed.pose_refinement import poses_of
 from perception.sfm.tracks import Features
 from perception.types import Lens
 from support.aimed import look_at

@@ -12,7 +12,7 @@ from PIL import Image
 
 from perception.localise.localiser import Localised, Localiser, NewPhoto, NotHere
 from perception.map.map import Map
-from perception.sfm.bundle_adjustment import Adjusted
+from perception.posed.bundle_adjustment import Adjusted
 from perception.types import DepthImage, Lens
 from support.painted_room import FOCAL, PaintedRoom, difference, pose_at, walk
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fuzz.core import SHELL, CoreTarget, guarded, intact
 from fuzz.run import LONGEST, load, names
-from perception.sfm import triangulate
+from perception.posed import triangulate
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
 target_of = cache(load)

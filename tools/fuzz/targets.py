@@ -231,7 +231,7 @@ def _colmap_binary() -> dict[str, bytes]:
 
 def _without_photos() -> None:
     """Photos are not matched, which is no reading: random points take the place of those that a file lacks."""
-    from perception.sfm import triangulate
+    from perception.posed import triangulate
 
     def random(views: list[Any], store: Any, seed: int) -> tuple[Any, Any, dict[str, Any]]:
         return (*triangulate.random_cloud(views, seed), {"warnings": []})

@@ -33,9 +33,9 @@ from perception.gaussians.views import TrainingView, depth_image, psnr, render, 
 from perception.inputs.load import load_scene
 from perception.photos.scene_file import load_saved_scene, save_scene
 from perception.pipeline.optimise import initial_gaussians
+from perception.posed.triangulate import posed_scene
 from perception.progress import Progress
 from perception.sfm.options import NO_CLOUD, ReadOptions
-from perception.sfm.triangulate import posed_scene
 from perception.types import Scene, View
 
 OTHERS = 16

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from perception.sfm.bundle_adjustment import Poses, adjust
-from perception.sfm.pose_refinement import poses_of
+from perception.posed.bundle_adjustment import Poses, adjust
+from perception.posed.pose_refinement import poses_of
 from perception.sfm.tracks import Tracks
 from support.aimed import look_at
 from support.views_at import views_at

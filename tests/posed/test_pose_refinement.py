@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from perception.geometry import align_similarity
-from perception.sfm.bundle_adjustment import Poses, _linearised, _Problem, starting_points
-from perception.sfm.pose_refinement import checked_poses, match_errors, moved_back, poses_of, refine
+from perception.posed.bundle_adjustment import Poses, _linearised, _Problem, starting_points
+from perception.posed.pose_refinement import checked_poses, match_errors, moved_back, poses_of, refine
 from perception.sfm.tracks import Features, Tracks, tracks_of
 from perception.types import View
 from support.aimed import look_at

@@ -13,11 +13,11 @@ from perception.geometry import inverse_se3
 from perception.photos.lens import camera_from_lens, lens_text, load_pycolmap
 from perception.photos.still import with_still
 from perception.photos.views import view_lens
+from perception.posed.pose_refinement import checked_poses
 from perception.sfm.database import FeatureStore, build_features
 from perception.sfm.exposure import with_gains
 from perception.sfm.model import cloud_of
 from perception.sfm.options import Cloud, ReadOptions
-from perception.sfm.pose_refinement import checked_poses
 from perception.sfm.tracks import features_of, tracks_of
 from perception.types import Lens, Scene, View
 

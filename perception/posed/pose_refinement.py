@@ -9,7 +9,7 @@ import numpy as np
 
 from perception.geometry import camera_centres, nearest_rotation
 from perception.photos.views import view_lens
-from perception.sfm.bundle_adjustment import Poses, adjust, residuals, starting_points
+from perception.posed.bundle_adjustment import Poses, adjust, residuals, starting_points
 from perception.sfm.tracks import Features, tracks_of
 from perception.types import View
 
