@@ -42,7 +42,7 @@ def inverse_se3(a_from_b: np.ndarray) -> np.ndarray:
 
 
 def camera_centres(camera_from_world: np.ndarray) -> np.ndarray:
-    """Camera centres [N, 3] in the world frame, of poses camera_from_world [N, 4, 4]."""
+    """Camera centres [N, 3] in the world frame, of poses camera_from_world [N, 3 or 4, 4]."""
     return np.asarray(-np.einsum("nji,nj->ni", camera_from_world[:, :3, :3], camera_from_world[:, :3, 3]))
 
 

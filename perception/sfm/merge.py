@@ -14,6 +14,7 @@ import numpy as np
 from perception.photos.lens import load_pycolmap
 from perception.sfm.database import FeatureStore
 from perception.sfm.incremental import MIN_MODEL_SIZE, take_out
+from perception.sfm.partition import OVERLAP
 
 Matches = dict[tuple[int, int], np.ndarray]
 
@@ -29,12 +30,13 @@ so 1e-5 is too early), and photos up to which its normal equations are solved by
 
 def without_repeats(found: Sequence[Sequence[Any]]) -> list[Any]:
     """The models of submodels, `found` in each, largest first: the largest of each submodel, by which its neighbours
-    may be joined, and others with at least MIN_MODEL_SIZE photos that no larger one has. Small ones that repeat photos
-    of others are what did not fit into their submodel."""
+    may be joined, if it has more photos than a neighbour adds, and others with at least MIN_MODEL_SIZE photos that no
+    larger one has. Small ones that repeat photos of others are what did not fit into their submodel."""
     kept, had = [], set[int]()
-    main = {id(max(models, key=_rank)) for models in found if models}
+    largest = [max(models, key=_rank) for models in found if models]
+    joins = {id(model) for model in largest if model.num_reg_images() > OVERLAP}
     for model in sorted((model for models in found for model in models), key=_rank, reverse=True):
-        if id(model) in main or len(set(model.reg_image_ids()) - had) >= MIN_MODEL_SIZE:
+        if id(model) in joins or len(set(model.reg_image_ids()) - had) >= MIN_MODEL_SIZE:
             kept.append(model)
             had |= set(model.reg_image_ids())
     return kept
@@ -127,11 +129,22 @@ def merged(models: Sequence[Any]) -> Any:
 
 
 def adjusted(model: Any, store: FeatureStore, options: Any, add: bool = True) -> Any:
-    """Points of all matches; then poses, points and intrinsics adjusted together, again where photos were missing.
-    add: photos that are missing are added."""
-    pycolmap = load_pycolmap()
+    """Points of all matches; then poses, points and intrinsics adjusted together, again where photos were missing; and
+    the points' colours. add: photos that are missing are added."""
+    model = refined(triangulated(model, store, options), store, options, add)
+    model.extract_colors_for_all_images(store.image_root)
+    return model
+
+
+def triangulated(model: Any, store: FeatureStore, options: Any) -> Any:
+    """The model with points of all matches, at its poses."""
     with TemporaryDirectory(dir=store.folder) as out:
-        model = pycolmap.triangulate_points(model, store.database, store.image_root, out, True, options)
+        return load_pycolmap().triangulate_points(model, store.database, store.image_root, out, True, options)
+
+
+def refined(model: Any, store: FeatureStore, options: Any, add: bool) -> Any:
+    """The model with poses, points and intrinsics adjusted. add: and photos that are missing."""
+    pycolmap = load_pycolmap()
     wanted = pycolmap.DatabaseCacheOptions(min_num_matches=options.min_num_matches)
     with pycolmap.Database.open(store.database) as db:
         cache = pycolmap.DatabaseCache.create(db, wanted)
@@ -149,7 +162,6 @@ def adjusted(model: Any, store: FeatureStore, options: Any, add: bool = True) ->
     if added:
         mapper.iterative_global_refinement(*limits, options.get_mapper(), adjustment, triangulation)
     mapper.end_reconstruction(False)
-    model.extract_colors_for_all_images(store.image_root)
     return model
 
 

@@ -2,7 +2,8 @@
 
 The photos are partitioned where few of them match; each submodel is mapped by one thread, in a frame of its own, as a
 task of the engine. Neighbouring submodels share some photos, by which they are aligned and merged; then one bundle
-adjustment goes over all. So time grows little faster than the number of photos, and the result is repeatable.
+adjustment goes over all, or over parts of very many photos. So time grows little faster than the number of photos, and
+the result is repeatable.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from pathlib import Path
 
 from perception.io.atomic import atomic_directory
 from perception.progress import QUIET, Progress
-from perception.sfm import incremental, merge, partition
+from perception.sfm import incremental, merge, partition, parts
 from perception.sfm.consistency import is_contradicted, outvoted_photos, verified_pairs
 from perception.sfm.database import FeatureStore, verified_matches
 from perception.sfm.feature_tasks import write_part
@@ -27,7 +28,8 @@ def map_submodels(store: FeatureStore, fixed: bool, options: ReadOptions) -> inc
     if not counts:
         return None
     seed, progress = options.seed, options.progress
-    submodels = partition.with_overlap(partition.divide(counts, partition.LARGEST), counts)
+    divided = partition.divide(counts, partition.LARGEST)
+    submodels = partition.with_overlap(divided, counts)
     folders = [_task(store, images, number, fixed, seed) for number, images in enumerate(submodels)]
     results = run_tasks(options.engine, submodel_task, folders, "poses: submodel", progress, each_core=True)
     found = [incremental.read_models(result) for result in results]
@@ -36,7 +38,10 @@ def map_submodels(store: FeatureStore, fixed: bool, options: ReadOptions) -> inc
         return None
     progress.update("poses: adjusting", 0, 1)
     best, *others = map(merge.merged, groups)
-    best = merge.adjusted(best, store, pipeline_options(fixed, seed, one_thread=True))
+    if best.num_reg_images() > parts.WHOLE:
+        best = parts.adjusted_in_parts(best, store, parts.parts_of(divided, counts), options)
+    else:
+        best = merge.adjusted(best, store, pipeline_options(fixed, seed, one_thread=True))
     pairs = verified_pairs(best, store.database)
     progress.update("poses: adjusting", 1, 1)
     if is_contradicted(pairs):
