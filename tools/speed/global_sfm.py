@@ -1,9 +1,10 @@
-"""Compares structure from motion in submodels, in one piece, and global, from the same matches.
+"""Compares structure from motion by submodels, in one piece, and global, from the same matches.
 
-In submodels is what `map` does with many photos; global is pycolmap.global_mapping. Printed are seconds, photos with a
-pose, and the distance of their cameras from given ones after alignment.
+By submodels is what `map` does with many photos; in parts: the same, with bundle adjustment as of very many; global is
+pycolmap.global_mapping. Printed are seconds, photos with a pose, and the distance of their cameras from given ones
+after alignment.
 
-python tools speed.global_sfm SCENE --first 300
+python tools speed.global_sfm SCENE --first 300 --ways by_submodels in_parts
 """
 
 from __future__ import annotations
@@ -14,12 +15,14 @@ import tempfile
 import time
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pycolmap
 
 from perception.geometry import align_similarity
 from perception.progress import Progress
+from perception.sfm import parts
 from perception.sfm.database import FeatureStore, build_features
 from perception.sfm.incremental import map_photos
 from perception.sfm.options import ReadOptions
@@ -30,6 +33,11 @@ def by_submodels(store: FeatureStore, count: int) -> Any:
     found = map_submodels(store, False, ReadOptions(store.folder))
     assert found is not None, "contradicted"
     return found[0][0]
+
+
+def in_parts(store: FeatureStore, count: int) -> Any:
+    with patch.object(parts, "WHOLE", 0):
+        return by_submodels(store, count)
 
 
 def incremental(store: FeatureStore, count: int) -> Any:
@@ -50,6 +58,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path, help="a folder with a transforms.json of true poses")
     parser.add_argument("--first", type=int, help="so many photos only")
+    ways = {find.__name__: find for find in (by_submodels, in_parts, incremental, globally)}
+    parser.add_argument("--ways", nargs="+", choices=ways, default=list(ways), help="those to compare (default: all)")
     options = parser.parse_args()
     frames = json.loads((options.scene / "transforms.json").read_text(encoding="utf-8"))["frames"][: options.first]
     photos = [options.scene / frame["file_path"] for frame in frames]
@@ -58,7 +68,7 @@ def main() -> None:
         started = time.perf_counter()
         store = build_features(photos, [None] * len(photos), ReadOptions(Path(folder)))
         print(f"{len(photos)} photos: features and matches {time.perf_counter() - started:.0f} s", flush=True)
-        for find in (by_submodels, incremental, globally):
+        for find in map(ways.__getitem__, options.ways):
             started, begun = time.perf_counter(), time.process_time()
             model = find(store, len(photos))
             seconds, cpu = time.perf_counter() - started, time.process_time() - begun
