@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import filecmp
+import itertools
 import json
 import math
 import shutil
@@ -30,8 +32,16 @@ from perception.map.checksums import EDITABLE, FACTS, IGNORED, REPORT, facts_of,
 from perception.map.files import ARCHIVES, FORMAT_VERSION, MapFiles
 from perception.map.map import Map
 from perception.map.replace import map_directory, writing
-from perception.photos.named_files import NamedFiles, folded
-from perception.photos.view_json import StoredView, moved_record, stored_view, view_from_json, view_json
+from perception.photos.named_files import NamedFiles, folded, parts_of
+from perception.photos.view_json import (
+    StoredView,
+    absolute,
+    locate_photo,
+    moved_record,
+    stored_view,
+    view_from_json,
+    view_json,
+)
 from perception.types import View
 
 LONGEST_LABEL = 200  # characters
@@ -134,11 +144,12 @@ def tidy_label(label: str) -> str:
 def relink(path: Path, folder: Path) -> dict[str, Any]:
     """Records for every view of the map at `path` the photo below `folder` with the same name and size.
 
-    A photo is searched by the view name ("a/0001.jpg"), that among the photos of its visit, else by the file name alone
-    if that is unique among files of its size below `folder`; capitals and small letters are the same.
-    Views without such a photo keep their record. Returns {"linked": count, "missing": names, "differ": names of
-    photos of another size, which are no photos of other views}. InputError when no photo is found, or while the map is
-    locked by another writer.
+    A photo is searched by the view name ("a/0001.jpg"), that among the photos of its visit, else by the file name
+    alone; capitals and small letters are the same. Where the photo recorded before can still be read, only a copy of it
+    is taken. Else, of files with one name and size, the one with most folders as recorded; one that fits more than one
+    view goes to the view whose folders it has. Views without such a photo keep their record. Returns {"linked": count,
+    "missing": names, "differ": names of photos of another size, which are no photos of other views}. InputError when no
+    photo is found, one may as well be of one view as of another, or while the map is locked by another writer.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: is no folder; give the one that holds the photos of {path}")
@@ -148,28 +159,54 @@ def relink(path: Path, folder: Path) -> dict[str, Any]:
     named = NamedFiles(folder)
     with writing(path):
         files = MapFiles(path)
-        entries, linked, left = [], set[Path](), dict[str, list[Path]]()
-        for entry, view in zip(files.facts.get("views", []), files.read("views"), strict=True):
+        entries, views = files.facts.get("views", []), files.read("views")
+        claims, left = defaultdict[Path, list[tuple[float, StoredView]]](list), dict[str, list[Path]]()
+        for view in views:
             alike = [file for file in by_name[folded(PurePosixPath(view.name).name)] if file.is_file()]
             exact = [file for file in map(named.find, (view.name, view.photo_name)) if file is not None]
             of_size = [[f for f in some if view.photo_bytes in (None, f.stat().st_size)] for some in (exact, alike)]
-            if not of_size[0] and len(of_size[1]) != 1:
-                left[view.name] = [] if of_size[1] else [*exact, *alike]
+            fits = {file: _likeness(view, path, file) for file in (of_size[0][:1] or of_size[1])}
+            best = [file for file, fit in fits.items() if fit == max(fits.values()) > 0]
+            if len(best) == 1:
+                claims[best[0]].append((fits[best[0]], view))
             else:
-                found = (of_size[0] or of_size[1])[0]
-                linked.add(found)
-                record = view_json(stored_view(view_from_json({**entry, "photo": str(found)}), path))
-                entry = {**entry, **{key: record[key] for key in ("photo", "photo_beside", "photo_bytes")}}
-            entries.append(entry)
+                left[view.name] = [] if of_size[1] else [*exact, *alike]
+        found = {name: file for file, claim in claims.items() for name in _owners(file, claim)}
+        left |= {view.name: [] for claim in claims.values() for _, view in claim if view.name not in found}
+        linked = set(found.values())
         differ = [name for name, others in left.items() if not linked.issuperset(others)]
         missing = [name for name, others in left.items() if linked.issuperset(others)]
         if not linked:
             other = f", {len(differ)} have another size than the photos of the map" if differ else ""
             raise InputError(f"{folder}: holds none of the {len(entries)} photos of {path}{other}; give their folder")
-        facts = {**files.facts, "views": entries}
+        for entry, view in zip(entries, views, strict=True):
+            if view.name in found:
+                record = view_json(stored_view(view_from_json({**entry, "photo": str(found[view.name])}), path))
+                entry |= {key: record[key] for key in ("photo", "photo_beside", "photo_bytes")}
         with atomic_file(path / FACTS) as aside:
-            _dump(aside, seal(facts) if "files" in facts else facts)
-    return {"linked": len(entries) - len(left), "missing": missing, "differ": differ}
+            _dump(aside, seal(files.facts) if "files" in files.facts else files.facts)
+    return {"linked": len(found), "missing": missing, "differ": differ}
+
+
+def _likeness(view: StoredView, path: Path, file: Path) -> float:
+    """How well a file of the name and size of a photo fits the view: infinity or 0 where the photo can still be read,
+    for they have the same bytes or not, else 1 plus the number of last parts in which its path is as recorded."""
+    with contextlib.suppress(InputError):
+        return math.inf if filecmp.cmp(locate_photo(view, path), file, shallow=False) else 0
+    parts = [reversed(parts_of(folded(str(place)))) for place in (view.photo, absolute(file))]
+    return 1 + sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], zip(*parts, strict=False)))
+
+
+def _owners(file: Path, claims: list[tuple[float, StoredView]]) -> list[str]:
+    """Names of the views that `file` fits best, of those with their likeness; InputError when they had other photos."""
+    most = max(fit for fit, _ in claims)
+    best = [view for fit, view in claims if fit == most]
+    other = next((view for view in best if view.photo != best[0].photo), None)
+    if other is not None and most < math.inf:
+        names = f"'{best[0].name}' and '{other.name}', which have one name and size"
+        was = f"{best[0].photo.parent} or {other.photo.parent}"
+        raise InputError(f"{file}: may be the photo of {names}; call its folder as it was called, {was}")
+    return [view.name for view in best]
 
 
 def write_gaussian_ply(path: Path, gmap: Map) -> None:

@@ -146,6 +146,37 @@ def test_relink_finds_the_photos_of_all_visits_below_one_folder(path: Path) -> N
     assert relink(path, moved / "visit2")["differ"] == ["s/00000.png", "visit2/00000.png"]
 
 
+def test_relink_tells_two_visits_photos_of_one_name_and_size_apart(path: Path) -> None:
+    """By content where the photo of a visit still lies where it did, by folders, and else not at all."""
+    gmap, home = read_map(path), path.parent
+    photo_of(home / "later" / "s" / "00000.png", BLUE)
+    view = View("s/00000.png", home / "later" / "s" / "00000.png", np.eye(3), 64, 48, np.eye(4))
+    gmap.views.append(replace(stored_view(view, path, visit=1), name="visit1/s/00000.png"))
+    gmap.info["visits"] = [{"time": None, "input": name, "photos": n} for n, name in enumerate(("a", "b"), 1)]
+    write_map(path, gmap)
+    assert len({(home / name / "s" / "00000.png").stat().st_size for name in ("photos", "later")}) == 1
+
+    def colors() -> list[tuple[int, ...]]:
+        shots = [cv2.imread(str(view.photo))[..., ::-1] for view in read_map(path).located_views()]
+        return [tuple(int(x) for x in np.median(shot.reshape(-1, 3), axis=0)) for shot in shots]
+
+    (home / "later").rename(moved := path.parents[1] / "moved")
+    assert relink(path, moved) == {"linked": 1, "missing": ["s/00000.png"], "differ": []}
+    assert colors() == [RED, BLUE]
+    shutil.copytree(home / "photos", path.parents[1] / "copy")
+    assert relink(path, path.parents[1] / "copy")["missing"] == ["visit1/s/00000.png"] and colors() == [RED, BLUE]
+    shutil.rmtree(path.parents[1] / "copy")
+    disk = path.parents[1] / "disk"
+    for name, folder in (("photos", home / "photos"), ("moved", moved)):
+        shutil.copytree(folder, disk / name)
+        shutil.rmtree(folder)
+    with pytest.raises(InputError, match=r"'s/00000\.png' and 'visit1/s/00000\.png', which have one name"):
+        relink(path, (disk / "photos").rename(disk / "unknown"))
+    (disk / "unknown").rename(disk / "copy")
+    assert relink(path, disk) == {"linked": 2, "missing": [], "differ": []}
+    assert colors() == [RED, BLUE]
+
+
 def test_relink_refuses_a_folder_without_the_photos(path: Path) -> None:
     before = (path / "map.json").read_bytes()
     other = path.parents[1] / "other"
