@@ -79,7 +79,7 @@ class _Rasterize(torch.autograd.Function):
         ctx.settings, ctx.stats = settings, stats
         if any(ctx.needs_input_grad):
             ctx.frames = out.frames
-            ctx.save_for_backward(*contiguous, *images)
+            ctx.save_for_backward(*tensors, *images)
         ctx.set_materialize_grads(False)
         visible = out.visible.view(torch.bool)
         ctx.mark_non_differentiable(visible)
@@ -87,7 +87,16 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor | None) -> Any:
-        saved = ctx.saved_tensors
+        gradients = _Rasterize.gradients(ctx, *cotangents)
+        if torch.is_grad_enabled():  # with create_graph=True
+            gradients = _Once.apply(*gradients, *ctx.saved_tensors, *cotangents)
+        return None, None, *gradients
+
+    @staticmethod
+    @torch.no_grad()
+    def gradients(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
+        """Those of the tensors of `Inputs.NAMES`, in that order; None where not needed."""
+        saved: list[Any] = [None if t is None else t.contiguous() for t in ctx.saved_tensors]
         inputs = Inputs(**dict(zip(Inputs.NAMES, saved[: len(Inputs.NAMES)], strict=True)))
         images = dict(zip(Forward.IMAGES, saved[len(Inputs.NAMES) :], strict=True))
         none = inputs.means.new_empty(0)
@@ -103,7 +112,19 @@ class _Rasterize(torch.autograd.Function):
         by_input = {name: getattr(gradients, name) for name in wanted}
         if "background" in needed and by_image.colors is not None:
             by_input["background"] = (by_image.colors * (1 - state.alphas)[..., None]).sum(dim=(1, 2))
-        return (None, None, *(by_input.get(name) for name in Inputs.NAMES))
+        return tuple(by_input.get(name) for name in Inputs.NAMES)
+
+
+class _Once(torch.autograd.Function):
+    """Passes on gradients, the first of `tensors`, which depend on all of them; their own cannot be computed."""
+
+    @staticmethod
+    def forward(_: Any, *tensors: Tensor | None) -> Any:
+        return tensors[: len(Inputs.NAMES)]
+
+    @staticmethod
+    def backward(*_: Any) -> Any:
+        raise RuntimeError("rasterize: can be differentiated once only; use its gradients without create_graph=True")
 
 
 def rasterize(
@@ -127,7 +148,7 @@ def rasterize(
     threads: int = 0,
     simd: str = "auto",
 ) -> Rasterization:
-    """Renders Gaussians into C cameras; differentiable in everything but Ks.
+    """Renders Gaussians into C cameras; differentiable, once, in everything but Ks.
 
     means [N,3] world, quats [N,4] wxyz of any norm, scales [N,3] > 0, opacities [N] in [0,1] (activated
     values), colors [N,3] RGB, or [N,K,3] spherical-harmonic coefficients of degree `sh_degree` (0 to 3,

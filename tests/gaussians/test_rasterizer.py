@@ -215,6 +215,20 @@ def test_backward_may_run_twice_and_adds_up():
     assert torch.equal(inputs["means"].grad, 2 * once)
 
 
+@pytest.mark.parametrize("power", [1, 2])
+@pytest.mark.parametrize("name", ["means", "scales", "viewmats"])
+def test_second_derivatives_are_refused_where_they_are_not_zero(name, power):
+    """Alone and beside other terms, by which autograd could leave them out; of Σ image, and of Σ image²."""
+    inputs = leaves(scene(n=50))
+    loss = perception.rasterize(**inputs).colors.pow(power).sum()
+    (first,) = torch.autograd.grad(loss, inputs[name], retain_graph=True)
+    (again,) = torch.autograd.grad(loss, inputs[name], create_graph=True)
+    assert torch.equal(first, again.detach())
+    for second in (again.sum(), again.sum() + inputs[name].square().sum()):
+        with pytest.raises(RuntimeError, match="differentiated once only"):
+            torch.autograd.grad(second, inputs[name], retain_graph=True, allow_unused=True)
+
+
 def test_absolute_gradients_are_the_sizes_of_what_each_pixel_adds_to_that_of_the_2d_mean():
     inputs, taps = scene(n=80, width=70, height=45, cameras=1), []
     theirs = reference.rasterize(**leaves(inputs), taps=taps)
