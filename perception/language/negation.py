@@ -10,8 +10,9 @@ from perception.language.printed import quoted_text
 from perception.language.shape_words import head_noun
 
 _NOT = re.compile(
-    r"^(?:there (?:is|are) )?(?:no|without|none)(?![-\w])|\bno longer\b|\b(?:all|anything|everything) but\b"
-    r"|(?<![-\w])(?:not|neither|nor|never|except)(?![-\w])|n['’]t\b",
+    r"^(?:there (?:is|are) )?(?:no|none)(?![-\w])|\bno longer\b|\b(?:all|anything|everything) but\b"
+    r"|(?<![-\w])(?:not|neither|nor|never|except|without|lacks|lacking)(?![-\w])|n['’]t\b"
+    r"|\b(?:with|has|have|having) no(?![-\w])",
     re.IGNORECASE,
 )
 _SIGNS = ("sign", "poster", "placard", "sticker", "label", "notice", "symbol")
@@ -19,12 +20,12 @@ _SIGNS = ("sign", "poster", "placard", "sticker", "label", "notice", "symbol")
 
 
 def negation_in(text: str) -> str | None:
-    """The error of a prompt that says what a thing is not, beyond its colours, None of others: to encoders "mug" and
-    "no mug" are alike. Quoted texts may say so, and names of signs."""
+    """The error of a prompt that says what a thing is not or lacks, beyond its colours, None of others: to encoders
+    "mug", "no mug" and "mug without a handle" are alike. Quoted texts may say so, and names of signs."""
     quoted = quoted_text(text)
     said = " ".join(text.split()) if quoted is None else quoted[0]
     colors = sum(word.startswith(NOT) for word in color_words(said))
     if len(_NOT.findall(said)) <= colors or head_noun(said) in _SIGNS:
         return None
-    found = 'says what a thing is not, which is understood of colours alone ("mug that is not red")'
+    found = 'says what a thing is not or lacks, which is understood of colours alone ("mug that is not red")'
     return f"query: {brief(text)} {found}; ask for what it is, and quote what is printed on it"

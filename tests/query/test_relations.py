@@ -48,6 +48,8 @@ def test_prompts_that_say_what_a_thing_is_not() -> None:
         *("mug not on the table", "mug that isn't on it", "mug that isn’t on it", "mug no longer on the table"),
         *("everything except the mug", "anything but a mug", "mug neither on nor in the box", 'not "COKE"'),
         *("no mug that is not red", "mug that is not red and not on the table", "mug not in the red box"),
+        *("mug without a handle", "desk with no mug", "mug that has no handle", "mug lacking a handle"),
+        *("red mug without a handle", "Without the lamp", "desk without a red mug or a lamp that is not on it"),
     )
     answered = (
         *(
@@ -57,8 +59,9 @@ def test_prompts_that_say_what_a_thing_is_not() -> None:
             "mug that is not red or blue",
             "mug that is not orange",
         ),
-        *("no smoking sign", "do not enter sign", '"no smoking"', 'mug that says "not today"', "mug without a handle"),
-        *("desk with no mug", "no-slip mat", "forget-me-not", "notebook", "knot", "all butter cookies", "nonstick pan"),
+        *("no smoking sign", "do not enter sign", '"no smoking"', 'mug that says "not today"', "mug without red"),
+        *("mug with no blue", "no-slip mat", "forget-me-not", "notebook", "knot", "all butter cookies"),
+        "nonstick pan",
     )
     assert [text for text in refused if negation_in(text) is None] == []
     assert [text for text in answered if negation_in(text) is not None] == []
