@@ -30,6 +30,7 @@ _LEAST_DEPTH = 0.05  # share of a photo's pixels that must have depth; other pho
 _GRID = 24  # pixels between the points by which neighbours are chosen
 _LEAST_GAIN = 1e-3  # mean usefulness that one more neighbour must add
 ANGLE, NARROWER, WIDER = 12.0, 5.0, 10.0  # degrees between rays: best one, standard deviations below and above it
+_LEAST_COSINE = 0.6  # of an angle, 53°: from there on two photos of a point add less than _LEAST_GAIN to one another
 
 
 @dataclass
@@ -141,15 +142,18 @@ def homographies(view: StereoView, other: StereoView) -> tuple[np.ndarray, np.nd
 def choose_neighbours(views: list[StereoView]) -> list[list[int]]:
     """Up to NEIGHBOURS other views per view that jointly observe its points, preferably at angles of 5° to 25°."""
     chosen: list[list[int]] = []
+    centers = np.array([view.center for view in views])
     for i, view in enumerate(views):
         points = _sample(view)
-        useful = np.stack([_usefulness(view, other, points) for other in views])
-        useful[i] = 0
+        ratio, cosine = _rays(points, view.center, centers)
+        near = np.flatnonzero((cosine > _LEAST_COSINE).any(axis=1))
+        near = near[near != i]
+        useful = _usefulness(points, [views[n] for n in near], ratio[near], cosine[near])
         first = second = np.zeros(len(points))  # usefulness of the best two chosen views for each point
         best_views: list[int] = []
-        while len(best_views) < min(NEIGHBOURS, len(views) - 1):
+        while len(best_views) < min(NEIGHBOURS, len(near)):
             gain = np.maximum(useful, first) + np.clip(np.minimum(useful, first), second, None) - first - second
-            gain = gain.sum(axis=1) / max(1, len(points))
+            gain = gain.sum(axis=1) / len(points)
             gain[best_views] = -1
             best = int(gain.argmax())
             if gain[best] < _LEAST_GAIN:
@@ -157,7 +161,7 @@ def choose_neighbours(views: list[StereoView]) -> list[list[int]]:
             best_views.append(best)
             second = np.maximum(second, np.minimum(useful[best], first))
             first = np.maximum(first, useful[best])
-        chosen.append(best_views)
+        chosen.append(near[best_views].tolist())
     return chosen
 
 
@@ -170,24 +174,32 @@ def _sample(view: StereoView) -> np.ndarray:
     return (points - view.camera_from_world[:3, 3]) @ view.camera_from_world[:3, :3]
 
 
-def _usefulness(view: StereoView, other: StereoView, points: np.ndarray) -> np.ndarray:
-    """[P] in [0, 1]: 0 where `other` does not see a point, else r exp(−((α − ANGLE) / σ)² / 2).
+def _rays(points: np.ndarray, center: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How points [P, 3] lie to the centre of a view and to those [V, 3] of all views: the ratio of the smaller to the
+    larger distance, and the cosine of the angle between both rays, [V, P] each."""
+    a = [points[:, k] - center[k] for k in range(3)]
+    b = [points[:, k] - centers[:, k, None] for k in range(3)]
+    far_a, far_b = (np.sqrt(x * x + y * y + z * z) for x, y, z in (a, b))
+    cosine = (a[0] * b[0] + a[1] * b[1] + a[2] * b[2]) / np.maximum(far_a * far_b, 1e-12)
+    closeness = far_b / np.maximum(far_a, 1e-12)
+    return np.minimum(closeness, 1 / np.maximum(closeness, 1e-12)), cosine
 
-    α: angle between the rays of both views to the point, degrees; σ: NARROWER below ANGLE, else WIDER; r: ratio of its
-    smaller to its larger distance from the views, as at twice the distance the resolution is half.
+
+def _usefulness(points: np.ndarray, others: list[StereoView], ratio: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+    """[V, P] in [0, 1]: 0 where one of `others` does not see a point, else r exp(−((α − ANGLE) / σ)² / 2).
+
+    r, α: ratio and angle, degrees, of `_rays` of the others; σ: NARROWER below ANGLE, else WIDER. r is there because at
+    twice the distance the resolution is half.
     """
-    local = points @ other.camera_from_world[:3, :3].T + other.camera_from_world[:3, 3]
-    z = np.maximum(local[:, 2], 1e-9)
-    pixel = local @ other.K.T / z[:, None]
-    h, w = other.grey.shape
-    inside = (local[:, 2] > 0) & (pixel[:, 0] > 0) & (pixel[:, 1] > 0) & (pixel[:, 0] < w) & (pixel[:, 1] < h)
-    a, b = points - view.center, points - other.center
-    cosine = (a * b).sum(axis=1) / np.maximum(np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1), 1e-12)
+    poses = np.array([other.camera_from_world for other in others]).reshape(-1, 4, 4)
+    Ks = np.array([other.K for other in others]).reshape(-1, 3, 3)
+    h, w = np.array([other.grey.shape for other in others]).reshape(-1, 2, 1).transpose(1, 0, 2)
+    local = points @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
+    x, y, _ = np.moveaxis(local @ Ks.transpose(0, 2, 1) / np.maximum(local[..., 2:], 1e-9), 2, 0)
+    seen = (local[..., 2] > 0) & (x > 0) & (y > 0) & (x < w) & (y < h)
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     width = np.where(angle < ANGLE, NARROWER, WIDER)
-    closeness = np.linalg.norm(b, axis=1) / np.maximum(np.linalg.norm(a, axis=1), 1e-12)
-    alike = np.minimum(closeness, 1 / np.maximum(closeness, 1e-12))
-    return np.asarray(inside * alike * np.exp(-(((angle - ANGLE) / width) ** 2) / 2))
+    return np.asarray(seen * ratio * np.exp(-(((angle - ANGLE) / width) ** 2) / 2))
 
 
 def confirmed(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -200,6 +201,48 @@ def test_a_photo_of_which_no_point_of_the_grid_has_depth_is_matched_with_none():
     assert (lines > 0).mean() > 0.05
     first, *others = choose_neighbours([replace(views[0], prior=lines), *views[1:]])
     assert first == [] and all(others)
+
+
+def test_neighbours_are_those_of_the_greedy_choice_written_out():
+    """Point by point: the sum of the usefulness of each point's best two photos grows most with every photo chosen."""
+    rng = np.random.default_rng(0)
+    views = true_views()
+    for view in list(views):  # some elsewhere, turned about their own y axis
+        c, s = np.cos(turn := rng.uniform(0, 2 * np.pi)), np.sin(turn)
+        pose = np.eye(4)
+        pose[:3] = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ view.camera_from_world[:3]
+        pose[:3, 3] += rng.normal(0, 1, 3)
+        views.append(replace(view, camera_from_world=pose, prior=view.prior * rng.uniform(0.5, 2)))
+    expected = []
+    for i, view in enumerate(views):
+        points = [
+            np.linalg.inv(view.camera_from_world) @ [*(z * (np.linalg.inv(view.K) @ [x + 0.5, y + 0.5, 1])), 1]
+            for y in range(12, view.prior.shape[0], 24)
+            for x in range(12, view.prior.shape[1], 24)
+            if (z := view.prior[y, x]) > 0
+        ]
+        useful = np.array([[0 if j == i else useful_at(p[:3], view, v) for p in points] for j, v in enumerate(views)])
+        near: list[int] = []
+        while len(near) < 6:
+            sums = [np.sort(useful[[*near, j]], axis=0)[-2:].sum() / len(points) for j in range(len(views))]
+            sums = [-1.0 if j in near else value for j, value in enumerate(sums)]
+            before = np.sort(useful[near], axis=0)[-2:].sum() / len(points)
+            if max(sums) - before < 1e-3:
+                break
+            near.append(int(np.argmax(sums)))
+        expected.append(near)
+    assert choose_neighbours(views) == expected
+    assert len({len(near) for near in expected}) > 1
+
+
+def useful_at(point: np.ndarray, view: StereoView, other: StereoView) -> float:
+    x, y, z = other.K @ (other.camera_from_world @ [*point, 1])[:3]
+    if z <= 0 or not (0 < x / z < other.grey.shape[1] and 0 < y / z < other.grey.shape[0]):
+        return 0.0
+    a, b = point - view.center, point - other.center
+    far, near = (float(np.linalg.norm(ray)) for ray in (a, b))
+    angle = math.degrees(math.acos(min(1.0, a @ b / far / near)))
+    return min(far / near, near / far) * math.exp(-(((angle - 12) / (5 if angle < 12 else 10)) ** 2) / 2)
 
 
 def test_planes_cover_the_depths_known():
