@@ -39,10 +39,11 @@ def index_maps(
     """Brings `maps` into the store at `store`, made if there is none, and takes those of `remove` out of it.
 
     Maps that the store holds already are replaced if they changed. Returns the counts `added`, `replaced`, `unchanged`
-    and `removed`, and of the whole store `maps` and `instances`. The store changes at the end, all at once. What an
-    interrupted run has prepared is used by the next one. InputError, and no change, for a folder that is no map, a map
-    without embeddings or of another encoder than the store's, a path to remove that the store does not hold, a folder
-    that is no store, and while another process writes the store.
+    and `removed`, of the whole store `maps` and `instances`, and `left_out`, in one line each why some of `maps` are as
+    the store had them: a folder that is no map, a map without embeddings or of another encoder than the store's. The
+    store changes at the end, all at once. What an interrupted run has prepared is used by the next one. InputError, and
+    no change, where all of `maps` are left out, for a path to remove that the store does not hold, a folder that is no
+    store, and while another process writes the store.
 
     >>> counts = index_maps(Path("all.store"), [Path("kitchen.gsmap")])
     >>> counts["added"], counts["instances"]
@@ -60,16 +61,21 @@ def index_maps(
                 raise InputError(f"{path}: is not one of the {len(entries)} maps in {store}; nothing was removed")
             counts["removed"] += 1
         paths = list(dict.fromkeys(Path(os.path.realpath(path)) for path in maps))
-        for path in paths:
-            if not (path / FACTS).is_file():
-                raise InputError(f"{path}: is no map (no {FACTS} inside); the store is as it was")
+        left_out = list[str]()
         for n, path in enumerate(paths, start=1):
             before = entries.get(str(path))
-            gmap = QueryMap.open(path, encoders=encoders)
-            if before is None or before["map_id"] != gmap.map_id:
-                entries[str(path)] = _indexed(store, gmap, facts)
-            counts["added" if before is None else "unchanged" if entries[str(path)] is before else "replaced"] += 1
+            try:
+                gmap = _opened(path, encoders)
+                if before is None or before["map_id"] != gmap.map_id:
+                    entries[str(path)] = _indexed(store, gmap, facts)
+            except InputError as error:
+                left_out.append(str(error))
+            else:
+                same = entries[str(path)] is before
+                counts["added" if before is None else "unchanged" if same else "replaced"] += 1
             progress.update("maps", n, len(paths))
+        if left_out and len(left_out) == len(paths):
+            raise InputError(f"{left_out[0]}; the store is as it was")
         if not entries:
             raise InputError(f"{store}: would hold no map; give maps, or delete it")
         facts["maps"] = [entries[path] for path in sorted(entries)]
@@ -78,7 +84,14 @@ def index_maps(
         for file in (store / "maps").iterdir():  # of other maps, and of writers that were killed
             if file.name not in listed and _is_ours(file):
                 file.unlink(missing_ok=True)
-    return {**counts, "maps": len(entries), "instances": sum(entry["instances"] for entry in entries.values())}
+    instances = sum(entry["instances"] for entry in entries.values())
+    return {**counts, "maps": len(entries), "instances": instances, "left_out": left_out}
+
+
+def _opened(path: Path, encoders: Encoders) -> QueryMap:
+    if not (path / FACTS).is_file():
+        raise InputError(f"{path}: is no map (no {FACTS} inside)")
+    return QueryMap.open(path, encoders=encoders)
 
 
 def _facts(store: Path) -> dict[str, Any]:

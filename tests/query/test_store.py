@@ -219,6 +219,27 @@ def test_a_map_that_cannot_be_had_leaves_the_store_as_it_was(maps: list[Path], t
     assert "\n" not in str(error.value) and contents(store) == before
 
 
+def test_maps_that_cannot_be_had_are_named_and_the_others_indexed(
+    maps: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of them was in the store, and stays in it as it was."""
+    monkeypatch.setattr("perception.query.indexing.make_encoder", encoders)
+    store, wordless = tmp_path / "s", Path(shutil.copytree(maps[1], tmp_path / "wordless.gsmap"))
+    index_maps(store, [wordless], encoders=encoders)
+    gmap = read_map(wordless)
+    gmap.language, gmap.instances[0]["label"] = {}, "the chalice"
+    write_map(wordless, gmap)
+    bad = [wordless, tmp_path / "none.gsmap"]
+    assert main(["index", *map(str, (*maps[2:4], *bad)), "-o", str(store)]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert said[-1] == "error: index: 2 of 4 maps were left out; mend them and run it again"
+    assert all(line.startswith(f"{path}: ") for line, path in zip(said[-3:-1], bad, strict=True))
+    assert [entry["map"] for entry in load_map(store, encoders).maps] == sorted(map(str, (wordless, *maps[2:4])))
+    clean = index_maps(tmp_path / "t", maps[2:4], encoders=encoders)
+    held = load_map(store, encoders).counts["instances"] - len(read_map(maps[1]).instances)
+    assert held == clean["instances"] and clean["left_out"] == []
+
+
 def test_embeddings_of_another_encoder_are_refused_at_the_prompt(store: Path) -> None:
     class Newer(HashEncoder):
         identity = "hash-test-2"
