@@ -8,9 +8,11 @@ import json
 import os
 import shlex
 import sys
+import threading
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
+from typing import NoReturn
 
 from perception import __version__
 from perception.cli.parser import Parser
@@ -19,6 +21,8 @@ from perception.machine import limit_threads
 
 _MODULES = ("mapping", "maps", "scoring", "serving", "models")
 """Files of this package that add subcommands, in the order of --help."""
+SERVERS = ("localiser", "query-")
+"""How the names of threads begin that `perception.serve` starts."""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -70,6 +74,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         advice = "give another path, or allow access to this one"
         return _refused(InputError(f"{error.filename}: {error.strerror}; {advice}"))
     return 0
+
+
+def run() -> NoReturn:
+    """The console script: `main`. A server's thread may be in compiled code for minutes, as when it reads the photos of
+    a map to localise others. It cannot be ended there, and Python would wait for it or abort: it ends with the process.
+    """
+    code = main()
+    if any(thread.daemon and thread.name.startswith(SERVERS) for thread in threading.enumerate()):
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
 
 
 def _answer(text: str) -> None:

@@ -1,7 +1,5 @@
 """`python -m perception.cli`."""
 
-import sys
+from perception.cli import run
 
-from perception.cli import main
-
-sys.exit(main())
+run()

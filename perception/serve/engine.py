@@ -234,8 +234,9 @@ class QueryEngine:
             **self._counters.to_json(),
         }
 
-    def close(self) -> None:
-        """Finishes running requests, ends waiting ones with EngineClosed, and joins the threads."""
+    def close(self, wait: float | None = None) -> None:
+        """Finishes running requests, for at most `wait` seconds (None: the engine's timeout), ends waiting ones with
+        EngineClosed, and joins the threads."""
         if self._closed.is_set():
             return
         self._closed.set()
@@ -244,7 +245,7 @@ class QueryEngine:
                 job.future.set_exception(EngineClosed(f"{self.path}: the engine has been closed"))
         for thread in self._threads:
             if thread is not threading.current_thread():
-                thread.join(timeout=self.timeout)
+                thread.join(timeout=self.timeout if wait is None else wait)
 
     def __enter__(self) -> QueryEngine:
         return self

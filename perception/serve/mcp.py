@@ -314,7 +314,10 @@ def serve_stdio(path: Path, encoders: Any = None, photos: Path | None = None) ->
     with QueryEngine(path, encoders=encoders) as engine:  # Ctrl-C cannot end the thread, which waits for input
         thread = threading.Thread(target=work, args=(make_server(engine, photos),), daemon=True)
         thread.start()
-        thread.join()
+        try:
+            thread.join()
+        finally:
+            engine.close(wait=0)  # nobody is there for an answer
 
 
 def serve_http(path: Path, settings: ServeSettings, encoders: Any = None, photos: Path | None = None) -> None:

@@ -44,7 +44,9 @@ HEAD = (
 )
 STDIO = HEAD + "from perception import cli\nserve = m.serve_stdio\n"
 STDIO += "m.serve_stdio = lambda path, photos: serve(path, encoders, photos)\n"
-STDIO += "sys.exit(cli.main(['mcp', *sys.argv[1:]]))\n"
+STDIO += "sys.argv.insert(1, 'mcp')\ncli.run()\n"
+BUSY = "import time, perception.serve.localise as p\nfrom concurrent.futures import ThreadPoolExecutor as Pool\n"
+BUSY += "p.Localiser = lambda *_, **__: list(Pool(1).map(time.sleep, [600]))\n"
 HTTP = HEAD + "from perception.serve.requests import ServeSettings\n"
 HTTP += "m.serve_http(Path(sys.argv[1]), ServeSettings(port=0, token=sys.argv[2] or None, timeout=60), encoders)\n"
 RED = 4
@@ -197,9 +199,9 @@ def test_every_tool_over_stdio_and_a_map_replaced_under_it(tmp_path: Path, photo
     ended(Client(stdio(path, "--photos", str(photo.parent))), session)
 
 
-def spoken(path: Path) -> subprocess.Popen[bytes]:
+def spoken(path: Path, first: str = "") -> subprocess.Popen[bytes]:
     process = subprocess.Popen(
-        [sys.executable, "-c", STDIO, str(path)],
+        [sys.executable, "-c", first + STDIO, str(path)],
         cwd=path.parent,  # in a checkout, Python would import the sources
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -247,6 +249,23 @@ def test_the_process_ends_with_its_client(tmp_path: Path, how: str) -> None:
         process.kill()
         with contextlib.suppress(ValueError):
             process.communicate()
+
+
+@pytest.mark.slow
+def test_the_process_does_not_wait_for_photos_that_are_being_read(tmp_path: Path, photo: Path) -> None:
+    """By a pool of threads, for ten minutes."""
+    process = spoken(write_map_of(tmp_path / "a.gsmap", gaussians=300), BUSY)
+    try:
+        picture = base64.b64encode(photo.read_bytes()).decode()
+        send(
+            process,
+            {"id": 2, "method": "tools/call", "params": {"name": "localise", "arguments": {"picture": picture}}},
+        )
+        assert process.stdout is not None and b"photos are being read" in process.stdout.readline()
+        process.communicate(timeout=60)  # closes its input
+        assert process.returncode == 0
+    finally:
+        process.kill()
 
 
 @pytest.mark.slow
