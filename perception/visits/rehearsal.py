@@ -12,6 +12,7 @@ import torch
 from perception.colors import sh_from_rgb
 from perception.gaussians.model import Gaussians
 from perception.gaussians.views import TrainingView, render
+from perception.io.memory import Keep
 from perception.photos.decode import scaled_K, scaled_size
 from perception.types import View
 from perception.visits.evidence import AGREE, sight
@@ -21,7 +22,7 @@ SHOWN, HIDDEN = 0.9, 0.05
 OVERLAP, SAMPLES = 0.1, 5000
 """Least share of what the visit sees in a view, relative to the view that shows most; points by which it is told."""
 MOST = 64
-"""Renders that are trained: they are held in memory."""
+"""Renders that are trained."""
 
 
 def showing(views: Sequence[View], gaussians: Gaussians, seen: np.ndarray) -> list[View]:
@@ -38,10 +39,10 @@ def showing(views: Sequence[View], gaussians: Gaussians, seen: np.ndarray) -> li
 
 
 def rehearsed(
-    views: Sequence[View], max_side: int, count: int, stays: Gaussians, others: Gaussians
+    views: Sequence[View], max_side: int, count: int, stays: Gaussians, others: Gaussians, keep: Keep = np.asarray
 ) -> list[TrainingView]:
     """At most `count` or MOST renders of what stays, evenly chosen of `views`, with long sides up to `max_side`. Pixels
-    in which one of the others stands in front, or stood, do not count."""
+    in which one of the others stands in front, or stood, do not count. keep: where images are held."""
     chosen = np.unique(np.linspace(0, len(views) - 1, min(count, MOST, len(views))).round().astype(int))
     marked = Gaussians.concatenate([stays, others])
     white = (torch.arange(len(marked)) >= len(stays)).float()
@@ -55,5 +56,5 @@ def rehearsed(
         other = render(marked, pose, K, width, height, harmonics=True).colors[0, ..., 0]
         weight = ((out.alphas[0] > SHOWN) & (other < HIDDEN)).float().cpu()
         photo = (255 * out.colors[0].clamp(0, 1)).round().to(torch.uint8).cpu()
-        made.append(TrainingView(f"rehearsed {view.name}", photo, None, K, pose, weight=weight))
+        made.append(TrainingView(f"rehearsed {view.name}", photo, None, K, pose, weight=weight, keep=keep).stored())
     return made

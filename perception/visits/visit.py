@@ -101,7 +101,8 @@ class Visit:
 
     def rehearsed(self, stays: Gaussians, others: Gaussians) -> list[TrainingView]:
         """Renders of what earlier visits saw, as many as there are photos, see `rehearsal.rehearsed`."""
-        return rehearsed(self.earlier, self.run.config.photos.max_side, len(self.photos.views), stays, others)
+        side, count = self.run.config.photos.max_side, len(self.photos.views)
+        return rehearsed(self.earlier, side, count, stays, others, self.run.new_keep())
 
     def owned(self, rows: np.ndarray) -> Owned:
         """The rows [R] of the map, as it has them."""

@@ -13,6 +13,7 @@ import torch
 
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.views import TrainingView, render
+from perception.io.memory import DiskArrays
 from perception.types import View
 from perception.visits.evidence import in_free_space, looked_at, signs_of
 from perception.visits.look import Look, in_view
@@ -161,6 +162,21 @@ def test_what_is_rehearsed_is_the_render_but_where_something_new_stands_or_stood
         image = render(wall(), view.camera_from_world, view.K, 160, 120, harmonics=True).colors[0]
         assert np.abs(view.photo.numpy() / 255 - image.numpy()).max() < 0.003
     assert (plain[0].weight.numpy()[(np.abs(row - 60) < 25) & (np.abs(column - 95) < 40)] == 1).all()
+
+
+def test_renders_lie_in_the_memory_of_photos_with_the_same_bits(tmp_path: Path) -> None:
+    """With none of it, in files: photo and weight of each view, and nothing else."""
+    arrays, kept = DiskArrays(tmp_path, 0), list[np.ndarray]()
+
+    def keep(image: np.ndarray) -> np.ndarray:
+        kept.append(arrays.keep(image))
+        return kept[-1]
+
+    plain, bounded = (rehearsed(VIEWS, 160, 9, wall(), wall().rows(torch.arange(0)), *given) for given in ((), (keep,)))
+    images = [image for view in bounded for image in (view.photo, view.weight)]
+    assert all(np.shares_memory(image.numpy(), there) for image, there in zip(images, kept, strict=True))
+    for view, other in zip(plain, bounded, strict=True):
+        assert torch.equal(view.photo, other.photo) and torch.equal(view.weight, other.weight)
 
 
 def test_views_of_the_other_side_of_a_wall_are_not_rehearsed() -> None:
