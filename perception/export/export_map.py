@@ -15,11 +15,11 @@ import numpy as np
 
 from perception.colors import instance_palette, rgb8_from_sh
 from perception.errors import InputError
-from perception.export.neighbors import nearest_gaussian
+from perception.export.neighbors import nearest_gaussian, scattered
 from perception.export.smooth import read_segments, segment_cloud, vote
 from perception.export.spz import write_spz
 from perception.frame.recentre import map_from_input
-from perception.geometry import check_similarity, move_points, scale_of
+from perception.geometry import check_similarity, move_points, scale_of, sums_by
 from perception.io.atomic import write_file
 from perception.io.cloud import left_out, read_cloud, write_cloud
 from perception.io.documents import refusing
@@ -35,6 +35,8 @@ MOST_VIEWS, LONG_SIDE = 90, 320  # views rendered for a registration, and their 
 
 SCANNET = Path("scannet")
 BESIDE = 0.1  # distance in diagonals of a map up to which a scan beside its bounds may be of its outermost things
+LONE = 0.25
+"""Share of a thing's spread by which a point is too far from all others to be smoothed with them."""
 
 
 @dataclass(frozen=True)
@@ -239,6 +241,14 @@ def _table(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def typical_spread(means: np.ndarray, ids: np.ndarray) -> float:
+    """Root mean square distance of the means [N, 3] of an instance, ids [N], from their centre, in the median."""
+    number, count = np.unique(ids, return_inverse=True, return_counts=True)[1:]
+    centers = sums_by(number, means, len(count)) / count[:, None]
+    squared = ((means - centers[number]) ** 2).sum(axis=1)
+    return float(np.median(np.sqrt(np.bincount(number, squared) / count)))
+
+
 def export_labels(
     means: np.ndarray, instance_ids: np.ndarray, cloud: PointCloud, options: ExportOptions | None = None
 ) -> np.ndarray:
@@ -257,6 +267,8 @@ def export_labels(
     else:
         segments = read_segments(options.segments, len(labels))
     inside = labels >= 0  # points beyond the map have no vote and stay unlabelled
+    if options.segments is None and (cloud.faces is None or not len(cloud.faces)):
+        inside &= ~scattered(cloud.points, LONE * typical_spread(means[used], instance_ids[used]))
     labels[inside] = vote(labels[inside], segments[inside])
     return labels
 

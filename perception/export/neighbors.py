@@ -68,6 +68,17 @@ def neighbor_lists(points: np.ndarray, k: int) -> np.ndarray:
     return Neighbors(points).query(points, min(k, finite, 1024))[0]
 
 
+def scattered(points: np.ndarray, distance: float) -> np.ndarray:
+    """[P] bool: those of points [P, 3] that are farther than `distance` from every other, or not finite."""
+    alone = np.ones(len(points), bool)
+    if np.isfinite(points).all(axis=1).any():
+        tree = Neighbors(points)
+        for begin in range(0, len(points), CHUNK):
+            rows = slice(begin, begin + CHUNK)
+            alone[rows] = tree.query(points[rows], 2, distance)[0][:, 1] < 0
+    return alone
+
+
 def list_normals(points: np.ndarray, lists: np.ndarray) -> np.ndarray:
     """Normals [P, 3] float32 of the planes through the neighbour lists [P, k] of points [P, 3]: the direction of least
     variance of a point and its neighbours, of arbitrary sign; zero where they span no plane."""

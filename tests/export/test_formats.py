@@ -53,6 +53,24 @@ def test_smoothing_repairs_wrong_gaussians_and_nan_points_get_nothing():
     assert right.mean() > 0.99
 
 
+def test_scattered_points_keep_their_own_labels_and_dense_ones_are_smoothed():
+    """Nine balls of radius 0.1, 0.3 apart: one to three points of each, alone and beside a dense scan of a floor."""
+    rng = np.random.default_rng(0)
+    centers = 0.3 * np.stack(np.meshgrid([0, 1, 2], [0, 1, 2], [1.0]), axis=-1).reshape(-1, 3)
+    truth = np.repeat(np.arange(9, dtype=np.int32), 400)
+    directions = rng.normal(size=(3600, 3))
+    means = centers[truth] + 0.1 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    for count in (1, 2, 3):
+        rows = np.concatenate([400 * n + np.arange(count) * 130 for n in range(9)])
+        found = export_labels(means, truth, PointCloud(means[rows]))
+        assert (found == truth[rows]).mean() >= (1.0 if count == 1 else 0.8)
+    floor = np.concatenate([rng.random((4000, 2)), np.zeros((4000, 1))], axis=1)
+    noisy = np.where(rng.random(4000) < 0.1, 8, 9).astype(np.int32)
+    points, ids = np.concatenate([means[::400], floor]), np.concatenate([truth, noisy])
+    found = export_labels(np.concatenate([means, floor]), ids, PointCloud(points))
+    assert (found[:9] == np.arange(9)).all() and (found[9:] == 9).all()
+
+
 def test_export_file_and_sidecar(tmp_path):
     cloud, labels = scene()
     instances = {0: {"score": 0.25, "label": "mug"}, 1: {"score": 0.5, "label": None}, 7: {"score": 1.0}}
