@@ -21,7 +21,8 @@ from perception.serve.bodies import AtBody, FindBody, NearestBody, QueryBody
 from perception.serve.engine import QueryEngine
 from perception.serve.guard import HANDLERS, OPEN, HttpGuard
 from perception.serve.localise import LocaliseBody
-from perception.serve.requests import ServeSettings, source
+from perception.serve.requests import Request as Prompt
+from perception.serve.requests import ServeSettings, error_line, source
 
 FORMATS = {"npz": "application/x-npz", "ply": "application/octet-stream"}  # name → media type
 
@@ -134,15 +135,28 @@ def add_state(app: FastAPI, engine: QueryEngine) -> None:
         return JSONResponse({"changed": changed, "map_id": engine.current.map_id})
 
 
+def answers(gmap: QueryMap, requests: Sequence[Prompt]) -> list[dict[str, Any]]:
+    """The entries of `results`: of a refused prompt text and error. InputError where all are refused."""
+    found, refused = list[dict[str, Any]](), list[InputError]()
+    for request in requests:
+        try:
+            found.append(request.answered(gmap).to_json())
+        except InputError as error:
+            refused.append(error)
+            found.append({"text": request.text, "error": error_line(error)})
+    if len(refused) == len(found):
+        raise refused[0]
+    return found
+
+
 def add_searches(app: FastAPI, queries: MapQueries) -> None:
     @app.post("/query")
     async def query(body: QueryBody, map_id: MapId = None) -> Response:
-        """The instances that answer each text, ranked."""
+        """The instances that answer each text, ranked; for a text that is refused, unless all are, "error" instead."""
         requests = body.requests()
 
         def work(gmap: QueryMap) -> dict[str, Any]:
-            results = [request.answered(gmap).to_json() for request in requests]
-            return {"results": results, **source(gmap, requests[0].frame), **gmap.visits_json()}
+            return {"results": answers(gmap, requests), **source(gmap, requests[0].frame), **gmap.visits_json()}
 
         return JSONResponse(await queries.result(map_id, None, work))
 

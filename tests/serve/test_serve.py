@@ -81,6 +81,21 @@ def test_a_query_answers_as_the_contract_says(client: TestClient, engine: QueryE
     assert single["results"] == [{"text": "nothing 7", "present": False, "hits": []}]
 
 
+def test_a_refused_prompt_of_several_leaves_the_others_answered(client: TestClient, engine: QueryEngine) -> None:
+    """What is refused has neither hits nor "present", so that no program takes it for absent."""
+    texts = ["teapot", "no mug", "lamp"]
+    results = client.post("/query", json={"text": texts, "top_k": 2, "min_score": 0}).json()["results"]
+    for text, result in zip(texts[::2], results[::2], strict=True):
+        assert result == {
+            "text": text,
+            "present": True,
+            "hits": [h.to_json() for h in engine.current.query(text, 2, 0)],
+        }
+    assert set(results[1]) == {"text", "error"} and "'no mug' says what a thing is not" in results[1]["error"]
+    for text in ("no mug", ["no mug"], ["no mug", "not a lamp"]):
+        refused(client.post("/query", json={"text": text}), 400, "'no mug' says what a thing is not")
+
+
 def test_lengths_in_a_frame_with_a_scale_are_not_told_to_be_metres(client: TestClient) -> None:
     for scale, metric in ((1.0, True), (1000.0, False)):
         frame = {"name": "base", "from_map": np.diag([scale, scale, scale, 1.0]).tolist()}
