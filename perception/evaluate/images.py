@@ -13,7 +13,7 @@ from perception.errors import InputError
 from perception.photos.decode import read_picture
 
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"}
-_WINDOW = 11  # pixels a side
+WINDOW = 11  # pixels a side
 
 PROTOCOL = {
     "psnr": "10 log10(1 / mean squared error), RGB in [0, 1], all pixels",
@@ -40,13 +40,13 @@ def ssim(prediction: np.ndarray, truth: np.ndarray, weight: np.ndarray | None = 
     """
     from skimage.metrics import structural_similarity
 
-    if min(prediction.shape[:2]) < _WINDOW:
+    if min(prediction.shape[:2]) < WINDOW:
         height, width = prediction.shape[:2]
-        raise InputError(f"pictures are {width}x{height} pixels; SSIM needs at least {_WINDOW} a side")
+        raise InputError(f"pictures are {width}x{height} pixels; SSIM needs at least {WINDOW} a side")
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "K1": 0.01, "K2": 0.03}
     pictures64 = [np.asarray(image, np.float64) for image in (prediction, truth)]
     mean, windows = structural_similarity(*pictures64, data_range=1.0, channel_axis=2, full=True, **options)
-    inside = slice(_WINDOW // 2, -(_WINDOW // 2))
+    inside = slice(WINDOW // 2, -(WINDOW // 2))
     if weight is None or not weight[inside, inside].any():
         return float(mean)
     return float(np.average(windows.mean(axis=2)[inside, inside], weights=weight[inside, inside]))

@@ -6,11 +6,13 @@ tabletop_a (62 of 640×480) 1.4 GiB. Estimates are accurate to about 20 %.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
 from perception.config import MapConfig
 from perception.errors import InputError
+from perception.evaluate.images import WINDOW
 from perception.gaussians.state import sized
 from perception.inputs.load import PhotoSizes, photo_sizes
 from perception.machine import memory_limit
@@ -44,11 +46,26 @@ def largest_budget(limit: int | None) -> int | None:
 
 
 def log_estimate(source: Path, config: MapConfig, log: Callable[[str], None]) -> None:
-    """Logs the estimate for the input `source` as one line; InputError if memory is not sufficient."""
+    """Logs the estimate for the input `source` as one line; InputError if memory is not sufficient, or the photos
+    are too small."""
     photos = photo_sizes(source)
     if photos.sizes:
+        check_size(photos, config.photos.max_side)
         needed = check_memory(photos, config)
         log(f"{photos.what}, trained at up to {config.photos.max_side} pixels: about {needed / 2**30:.1f} GiB")
+
+
+def check_size(photos: PhotoSizes, max_side: int) -> None:
+    """InputError where most photos would be trained with a side of less than WINDOW pixels, too small to be scored."""
+    width, height = sorted(photos.sizes, key=lambda size: min(size) * min(1.0, max_side / max(size)))[
+        len(photos.sizes) // 2
+    ]
+    least = math.ceil(WINDOW * max(width, height) / min(width, height))
+    if min(width, height) < WINDOW:
+        raise InputError(f"{photos.what} of {width}×{height} pixels; a map needs at least {WINDOW} a side")
+    if max_side < least:
+        found = f"of {width}×{height} pixels would have a side of less than {WINDOW}; give --max-side {least} or more"
+        raise InputError(f"{photos.what} {found}")
 
 
 def check_memory(photos: PhotoSizes, config: MapConfig, limit: int | None = None) -> int:

@@ -12,7 +12,7 @@ from perception.config import load_config
 from perception.errors import InputError
 from perception.inputs.load import PhotoSizes, photo_sizes
 from perception.pipeline import estimate as module
-from perception.pipeline.estimate import check_memory, log_estimate, needed_bytes
+from perception.pipeline.estimate import check_memory, check_size, log_estimate, needed_bytes
 
 GIB = 2**30
 
@@ -64,3 +64,19 @@ def test_the_line_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_sizes_of_posed_inputs(small_scene: Path) -> None:
     found = photo_sizes(small_scene)
     assert found == photo_sizes(small_scene / "transforms.json") == PhotoSizes([(128, 96)] * 12, "12 photos")
+
+
+@pytest.mark.parametrize(("size", "least"), [((270, 480), 20), ((640, 480), 15), ((4000, 1000), 44)])
+def test_photos_too_small_to_be_scored_are_refused_before_the_work(size: tuple[int, int], least: int) -> None:
+    """It was told after the training, by SSIM, whose windows have 11 pixels a side. One small file among others is not
+    counted: it is left out later."""
+    photos = PhotoSizes([size] * 4 + [(8, 8)], "5 photos")
+    check_size(photos, least)
+    side = max(size)
+    assert round(min(size) * least / side) >= 11 > round(min(size) * (least - 2) / side)
+    with pytest.raises(
+        InputError, match=rf"^5 photos of {size[0]}×{size[1]} pixels .* give --max-side {least} or more$"
+    ):
+        check_size(photos, least - 1)
+    with pytest.raises(InputError, match="at least 11 a side"):
+        check_size(PhotoSizes([(300, 10)], "1 photo"), 800)
