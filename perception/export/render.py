@@ -31,6 +31,8 @@ from perception.query.query_map import QueryMap
 from perception.types import View
 
 KINDS = ("rgb", "depth", "instances", "features")
+TURNED = 15.0
+"""Degrees by which no photo is turned by refined poses: its camera is in another frame."""
 WIDEST = 5.0
 """Tangent of the angle to the axis, 79°, up to which a lens is rendered: at 90° the pinhole image has no end."""
 
@@ -64,7 +66,21 @@ def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[st
         for file, view in zip(files, views, strict=True):
             write_picture(folder / file, _through_lens(kind, gaussians, gmap, view))
     facts = {"output": str(output), "views": len(views), "what": what}
-    return facts, f"{output}: {len(views)} views of {', '.join(what)}"
+    text = f"{output}: {len(views)} views of {', '.join(what)}"
+    if (turn := turned(views, gmap.views)) > TURNED:
+        facts["warning"] = (
+            f"{cameras}: turned by {turn:.0f}° against the map's photos of the same names; another frame?"
+        )
+        text += f"\nwarning: {facts['warning']}"
+    return facts, text
+
+
+def turned(views: list[View], others: list[View]) -> float:
+    """Degrees between the axes of views and of those of `others` with the same name: their median, 0 without any."""
+    known = {view.name: view.camera_from_world[:3, :3] for view in others}
+    pairs = [(view.camera_from_world[:3, :3], known[view.name]) for view in views if view.name in known]
+    cosines = [(np.trace(a @ b.T) - 1) / 2 for a, b in pairs]
+    return float(np.degrees(np.arccos(np.clip(np.median(cosines), -1, 1)))) if cosines else 0.0
 
 
 def _picture_names(names: list[str]) -> list[str]:

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from perception.errors import InputError
 from perception.export.render import render_map
@@ -66,6 +67,20 @@ def test_photos_beside_the_camera_files_folder_are_rendered_below_the_output(tmp
     assert files(tmp_path) == {"deep/out/1.png", "deep/out/left/2.png"}
     picture = cv2.imread(str(tmp_path / "deep" / "out" / "1.png"))
     assert picture is not None and picture.shape == (24, 32, 3)
+
+
+@pytest.mark.parametrize("degrees", [0, 10, 20, 180])
+def test_cameras_of_another_frame_are_told_by_the_photos_of_their_names(degrees: int, tmp_path: Path) -> None:
+    path, turn = received_map(tmp_path, "a.jpg"), np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+    cameras = camera_file(tmp_path, ["a.jpg", "b.jpg"])
+    known = json.loads(cameras.read_text())
+    for frame in known["frames"]:
+        frame["transform_matrix"] = (turn @ frame["transform_matrix"]).tolist()
+    cameras.write_text(json.dumps(known))
+    facts, text = render_map(path, tmp_path / "out", cameras, ["rgb"])
+    assert (f"turned by {degrees}°" in text) == ("warning" in facts) == (degrees > 15)
+    assert "warning" not in render_map(path, tmp_path / "out2", None, ["rgb"])[0]
 
 
 def test_depth_that_16_bits_do_not_hold_is_none(tmp_path: Path) -> None:
