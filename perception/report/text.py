@@ -50,12 +50,14 @@ def info_text(path: Path, info: dict[str, Any], entries: Sequence[dict[str, Any]
     warnings = [f"warning: {text}" for text in scene.get("warnings", [])]
     count = info["num_instances"] - sum(map(is_removed, entries))
     unit = "in metres" if info.get("metric") else "without a metric scale"
+    visits = info.get("visits")
+    made = f"updated from {visits[-1]['input']}" if visits else f"made from {info.get('source')}"
     lines = [
         f"{path}: {count} instances in {info['num_gaussians']:,} Gaussians, "
         f"from {len(info.get('views', []))} photos, {unit}",
         _verdict(quality, len(left_out), len(warnings)),
         "next: " + _next_step(path, info),
-        f"made from {info.get('source')} (seed {info.get('seed')}) in {seconds.get('total', 0):.0f} s: "
+        f"{made} (seed {info.get('seed')}) in {seconds.get('total', 0):.0f} s: "
         + ", ".join(f"{name} {value:.0f}" for name, value in seconds.items() if name != "total"),
         f"trained {training.get('iterations')} iterations ({training.get('pairs', 0) / trained / 1e6:.1f} M pairs/s), "
         f"harmonics of degree {info['sh_degree']}; peak memory {info.get('peak_memory_mib')} MiB",
@@ -64,7 +66,7 @@ def info_text(path: Path, info: dict[str, Any], entries: Sequence[dict[str, Any]
     if still := scene.get("still"):
         what = f"{still['share']:.1%} of the pixels of {still['photos']} photos"
         lines.append(f"ignored, as it stays in the picture while the camera moves: {what} ({path / IGNORED})")
-    if visits := info.get("visits"):
+    if visits:
         dates, newest = visits_of(info), len(visits) - 1
         states = state_counts(changes_of(dates, list(entries), max(newest - 1, 0)))
         more = f"perception changes {shell_word(path)}"

@@ -69,6 +69,14 @@ def test_the_first_three_lines_of_info_are_what_how_good_and_what_next() -> None
     assert "perception scale" in info_text(Path("k.gsmap"), {**info, "metric": False}).splitlines()[2]
 
 
+def test_info_names_the_photos_that_the_times_are_of() -> None:
+    info: dict[str, Any] = {"num_gaussians": 9, "num_instances": 0, "sh_degree": 1, "source": "before", "seed": 0}
+    info["seconds"] = {"poses": 60.0, "total": 91.4}
+    assert "made from before (seed 0) in 91 s: poses 60" in info_text(Path("k.gsmap"), info).splitlines()
+    info["visits"] = [{"time": None, "input": name, "photos": 9} for name in ("before", "today")]
+    assert "updated from today (seed 0) in 91 s: poses 60" in info_text(Path("k.gsmap"), info).splitlines()
+
+
 @pytest.mark.parametrize("name", ["k.gsmap", "my kitchen's.gsmap", "-k.gsmap"])
 def test_the_next_command_can_be_copied_for_any_name(name: str) -> None:
     info = {"num_gaussians": 9, "num_instances": 6, "sh_degree": 1, "metric": True, "views": []}
