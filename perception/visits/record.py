@@ -22,6 +22,9 @@ from perception.visits.evidence import UNSEEN, Signs, probability
 from perception.visits.motion import Motion
 
 _GEOMETRY = ("num_gaussians", "centroid", "obb", "aabb")
+NOWHERE = 0.7
+"""Probability that what does not stand where it stood, and was found nowhere else, was removed; else it moved. Of 23
+things of made visits said to be removed .65 were, where signs alone say .94; of 20 kept aside .75."""
 _TAKEN, _OFFSET = 36867, 36881  # EXIF DateTimeOriginal and OffsetTimeOriginal
 
 
@@ -89,7 +92,7 @@ def recorded(entry: dict[str, Any], visit: int, signs: Signs, motion: Motion | N
     past, sure = [*entry.get("past", ()), stood], 1 - sure
     if motion is None:
         entry = {key: value for key, value in entry.items() if key != "parts"}
-        entry |= {"state": "removed", "confidence": round(sure, 3), "num_gaussians": 0}
+        entry |= {"state": "removed", "confidence": round(sure * NOWHERE, 3), "num_gaussians": 0}
     else:
         entry |= {"state": "moved", "confidence": round(sure * probability(motion.odds), 3), "last_seen": visit}
     return {**entry, "last_looked_for": visit, "past": past}

@@ -17,7 +17,7 @@ from perception.io.memory import DiskArrays
 from perception.types import View
 from perception.visits.evidence import in_free_space, looked_at, signs_of
 from perception.visits.look import Look, in_view
-from perception.visits.record import with_parts
+from perception.visits.record import recorded, with_parts
 from perception.visits.rehearsal import rehearsed, showing
 
 SHAPE = 40, 50
@@ -143,6 +143,17 @@ def test_a_place_was_looked_at_where_two_views_saw_it_before_the_wall() -> None:
     assert looked.tolist() == [True, True, False, False, False, False, True]
     assert through.tolist() == [True, False, False, False, False, False, False], "to the wall, not on or past it"
     assert not np.any(looked_at(wall(), VIEWS[:1], points))
+
+
+def test_removed_is_less_sure_than_that_it_does_not_stand_there() -> None:
+    """Of 43 things of made visits that were said to be removed 30 were, and 13 moved."""
+    (signs,) = signs_of([shown(4.0, same=False)] * 3, [7], np.ones(1), np.ones(1))
+    entry = {"id": 7, "centroid": [0.0] * 3, "obb": {}, "aabb": {}}
+    sure = 1 / (1 + np.exp(signs.log_odds / 2))
+    removed = recorded(entry, 1, signs, None, True)
+    assert removed["state"] == "removed" and sure > 0.8
+    assert removed["confidence"] == pytest.approx(sure * 30 / 43, abs=0.01)
+    assert recorded(entry, 1, signs, None, False)["confidence"] == pytest.approx(1 - sure, abs=1e-3)
 
 
 def test_what_is_rehearsed_is_the_render_but_where_something_new_stands_or_stood() -> None:
