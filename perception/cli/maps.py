@@ -169,8 +169,10 @@ def _relink(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
     facts = relink(args.map, args.folder)
     lines = [f"{args.map}: {facts['linked']} photos found in {args.folder}"]
-    lines += [f"warning: {name}: not found there, or more than once" for name in facts["missing"]]
-    lines += [f"warning: {name}: another size than the photo of the map; left out" for name in facts["differ"]]
+    for kind, why in (("missing", "not found there or more than once"), ("differ", "of another size there")):
+        if names := facts[kind]:
+            shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+            lines.append(f"{len(names)} left as they were, {why}: {shown}")
     return facts, "\n".join(lines)
 
 

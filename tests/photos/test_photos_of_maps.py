@@ -119,7 +119,7 @@ def test_relink_finds_the_photos_of_a_later_visit_in_its_folders(path: Path) -> 
     assert found == [moved / "left" / "1.png", moved / "right" / "1.png"]
 
 
-def test_relink_finds_the_photos_of_all_visits_below_one_folder(path: Path) -> None:
+def test_relink_finds_the_photos_of_all_visits_below_one_folder(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The visits have the same file names, so that sizes tell their photos apart; of two of one size none is taken."""
     gmap, disk = read_map(path), path.parents[1] / "disk"
     for visit, width in ((1, 200), (2, 400)):
@@ -137,6 +137,12 @@ def test_relink_finds_the_photos_of_all_visits_below_one_folder(path: Path) -> N
     (moved / "first").rename(moved / "again")
     shutil.copytree(moved / "again", moved / "twice")
     assert relink(path, moved) == {"linked": 2, "missing": ["s/00000.png"], "differ": []}
+    assert main(["relink", str(path), str(moved)]) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert told == [
+        f"{path}: 2 photos found in {moved}",
+        "1 left as they were, not found there or more than once: s/00000.png",
+    ]
     photo_of(moved / "visit2/images/00000.png", RED, 300)  # edited
     for folder, linked in ((moved / "visit1/images", "visit1/00000.png"), (moved / "twice/s", "s/00000.png")):
         others = [name for name in ("s/00000.png", "visit1/00000.png", "visit2/00000.png") if name != linked]
