@@ -128,7 +128,7 @@ def _index(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     changes = ", ".join(f"{facts[word]} {word}" for word in ("added", "replaced", "unchanged", "removed"))
     text = f"{args.output}: {facts['instances']} instances of {facts['maps']} maps ({changes})"
     if left_out := facts.pop("left_out"):
-        progress.log("\n".join([text, *left_out]))
+        Progress().log("\n".join([text, *left_out]))
         raise InputError(f"index: {len(left_out)} of {len(args.maps)} maps were left out; mend them and run it again")
     return {"store": str(args.output), **facts}, text
 

@@ -230,8 +230,10 @@ def test_maps_that_cannot_be_had_are_named_and_the_others_indexed(
     gmap.language, gmap.instances[0]["label"] = {}, "the chalice"
     write_map(wordless, gmap)
     bad = [wordless, tmp_path / "none.gsmap"]
-    assert main(["index", *map(str, (*maps[2:4], *bad)), "-o", str(store)]) == 2
-    said = capsys.readouterr().err.splitlines()
+    assert main(["index", *map(str, (*maps[2:4], *bad)), "-o", str(store), "--json"]) == 2
+    out, err = capsys.readouterr()
+    said = err.splitlines()
+    assert out == ""
     assert said[-1] == "error: index: 2 of 4 maps were left out; mend them and run it again"
     assert all(line.startswith(f"{path}: ") for line, path in zip(said[-3:-1], bad, strict=True))
     assert [entry["map"] for entry in load_map(store, encoders).maps] == sorted(map(str, (wordless, *maps[2:4])))
