@@ -10,7 +10,7 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from support.rasterizer import grads_and_images, scene
 
 CSRC = Path(__file__).resolve().parents[2] / "csrc"
 FLAGS = (
-    "-std=c++17", "-O1", "-march=native", "-ffp-contract=off", "-fPIC", "-shared",
+    "-std=c++17", "-march=native", "-ffp-contract=off", "-fPIC", "-shared",
     "-U_FORTIFY_SOURCE",  # its longjmp refuses to go to another stack
 )  # fmt: skip
 IN_ORDER, REVERSED = 0, 1
@@ -47,17 +47,18 @@ def _folder() -> Path:
 
 
 @functools.cache
-def build(options: KernelOptions, edit: tuple[str, str] | None) -> ctypes.CDLL:
-    """The emulator as a driver library. edit: (found, replaced) of a mutation test, once in the sources."""
+def build(options: KernelOptions, *edits: tuple[str, str]) -> ctypes.CDLL:
+    """The emulator as a driver library. edits: (found, replaced) of a mutation test, each once in the sources."""
     target = Path(tempfile.mkdtemp(dir=_folder()))
     texts = {file.name: file.read_text() for file in (CSRC / "cuda").iterdir()}
-    if edit is not None:
+    for edit in edits:
         changed = [name for name, text in texts.items() if edit[0] in text]
         assert len(changed) == 1 and texts[changed[0]].count(edit[0]) == 1, f"not exactly once in the sources: {edit}"
         texts[changed[0]] = texts[changed[0]].replace(*edit)
     for name, text in texts.items():
         (target / name).write_text(text)
-    command = [find_compiler(), *FLAGS, *options.defines(), f"-I{CSRC / 'rasterizer'}"]
+    level = "-Og" if edits else "-O1"  # what runs once is compiled in less time
+    command = [find_compiler(), *FLAGS, level, *options.defines(), f"-I{CSRC / 'rasterizer'}"]
     subprocess.run([*command, str(target / "emulator.cpp"), "-o", str(target / "emulator.so")], check=True)
     library = ctypes.CDLL(str(target / "emulator.so"))
     _libraries.append(library)
@@ -83,11 +84,11 @@ def _address_and_tell(tensor):
 on_device._address = _address_and_tell
 
 
-def emulated(lanes: int = IN_ORDER, edit: tuple[str, str] | None = None) -> KernelsFor:
+def emulated(lanes: int = IN_ORDER, edits: Sequence[tuple[str, str]] = ()) -> KernelsFor:
     """What stands for `device_kernels`. lanes: IN_ORDER, REVERSED or a seed of shuffles."""
 
     def kernels_for(options: KernelOptions, device: torch.device) -> Kernels:
-        driver = build(options, edit)
+        driver = build(options, *edits)
         driver.emulator_lane_order(ctypes.c_uint64(lanes))
         return Kernels(driver, b"\x7fELF", lambda: nullcontext(0))
 
@@ -104,9 +105,9 @@ def on_emulator(kernels_for: KernelsFor) -> Iterator[None]:
         yield
 
 
-def emulate(inputs, lanes=IN_ORDER, edit=None, **options):
+def emulate(inputs, lanes=IN_ORDER, edits=(), **options):
     """`grads_and_images` by the CUDA kernels."""
-    with on_emulator(emulated(lanes, edit)):
+    with on_emulator(emulated(lanes, edits)):
         return grads_and_images(inputs, **options)
 
 

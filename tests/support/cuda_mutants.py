@@ -56,20 +56,20 @@ SLIPS = [
 ]  # fmt: skip
 
 
-def mutant_scene():
+def mutant_scene(dims=3):
     """Tiles with more than a batch of splats, Gaussians with many tiles, clamped alphas and colours."""
-    inputs = wide_scene(n=400, width=100, height=70, dims=3, sh_degree=1)
+    inputs = wide_scene(n=400, width=100, height=70, dims=dims, sh_degree=1)
     inputs["Ks"] = torch.tensor([[[80.0, 0, 53.0], [0, 87.0, 30.0], [0, 0, 1]]], dtype=torch.float64)
     inputs["opacities"] *= 0.4
     inputs["opacities"][::7] = 1.0
     return inputs
 
 
-def is_noticed(edit):
-    """Whether the emulator refuses it, or images or gradients differ from the CPU's."""
+def is_noticed(*edits):
+    """Whether the emulator refuses them, or images or gradients differ from the CPU's."""
     inputs = mutant_scene()
     try:
-        found = emulate(inputs, edit=edit)
+        found = emulate(inputs, edits=edits)
     except RuntimeError as error:
         return "CUDA error 719" in str(error)
     return worst(found, grads_and_images(inputs)) > 1e-9
