@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -12,28 +13,35 @@ from perception.evaluate.instances import evaluate
 from support.ap import evaluate_masks
 
 
-def slow_ap(masks, scores, classes, gt_ids, gt_classes, label, threshold, min_region):
-    """One mask at a time, straight from the rules: Python sets, an explicit curve, trapezoids between
-    neighbours.
-    """
+@cache
+def iou(a, b):
+    return len(a & b) / len(a | b)
+
+
+def slow_aps(masks, scores, classes, gt_ids, gt_classes, label, thresholds, min_region):
+    """`slow_ap` at each threshold, of the masks as sets of points."""
     preds = []
     for mask, score, cls in zip(masks, scores, classes, strict=True):
-        points = set(np.flatnonzero(mask).tolist())
+        points = frozenset(np.flatnonzero(mask).tolist())
         if cls == label and len(points) >= max(min_region, 1):
             preds.append((points, score))
     truths = []
     for g in sorted(set(gt_ids.tolist())):
         if g > 0 and gt_classes[g] == label:
-            truths.append(set(np.flatnonzero(gt_ids == g).tolist()))
+            truths.append(frozenset(np.flatnonzero(gt_ids == g).tolist()))
     void = set(np.flatnonzero(gt_ids <= 0).tolist())
+    return [slow_ap(preds, truths, void, threshold, min_region) for threshold in thresholds]
+
+
+def slow_ap(preds, truths, void, threshold, min_region):
+    """One mask at a time, straight from the rules: Python sets, an explicit curve, trapezoids between
+    neighbours.
+    """
     big = [t for t in truths if len(t) >= min_region]
     if not big:
         return math.nan
     if not preds:
         return 0.0
-
-    def iou(a, b):
-        return len(a & b) / len(a | b)
 
     events, misses, used = [], 0, [False] * len(preds)
     for t in big:
@@ -104,7 +112,7 @@ def test_agrees_with_a_plain_implementation_on_200_cases(block):
         kinds = gt_classes if by_class else dict.fromkeys(range(-1, 14), 1)
         thresholds = [*np.arange(0.5, 0.95, 0.05), 0.25]
         chosen = classes if by_class else np.ones(len(masks), int)
-        want = [[slow_ap(masks, scores, chosen, gt_ids, kinds, c, t, 40) for t in thresholds] for c in labels]
+        want = [slow_aps(masks, scores, chosen, gt_ids, kinds, c, thresholds, 40) for c in labels]
         want = np.array(want)[~np.isnan(np.array(want)[:, 0])]
         assert got["ap"] == pytest.approx(want[:, :9].mean(), abs=1e-9)
         assert got["ap50"] == pytest.approx(want[:, 0].mean(), abs=1e-9)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import sparse
-from sklearn.metrics import adjusted_rand_score
 
 pytest.importorskip("perception._core")
 from perception.instances import assign
 from perception.masks import consensus
 from perception.masks.votes import MaskVotes
 from speed.grouping import building, grouped
+from support.blob_scenes import rand_index
 
 
 @pytest.mark.parametrize("together", [None, 100])
@@ -22,7 +22,7 @@ def test_the_objects_of_a_building_are_found(together: int | None, monkeypatch: 
     means, features, votes, truth = building(12_000, 12)
     found = grouped(means, features, votes)
     known = found.ids >= 0
-    assert known.mean() > 0.95 and adjusted_rand_score(truth[known], found.ids[known]) > 0.97
+    assert known.mean() > 0.95 and rand_index(truth[known], found.ids[known]) > 0.97
 
 
 def test_tables_of_many_photos_are_made_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:

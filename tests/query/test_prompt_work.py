@@ -6,7 +6,8 @@ import contextlib
 import re
 import sys
 from collections.abc import Callable, Iterator
-from types import FrameType
+from functools import lru_cache
+from types import FrameType, ModuleType
 from typing import Any
 
 import pytest
@@ -56,19 +57,24 @@ def paths(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Callable[[str],
     return query_paths(tmp_path_factory.mktemp("paths"))
 
 
+@lru_cache(1)
+def expressions(_: int) -> list[tuple[ModuleType, str, re.Pattern[str]]]:
+    """Those of the modules that see a prompt, found anew when more modules are loaded."""
+    homes = tuple(f"perception.{name}" for name in ("language", "query", "serve", "node", "viewer", "mcp"))
+    return [
+        (module, name, value)
+        for home, module in list(sys.modules.items()) if home.startswith(homes)
+        for name, value in vars(module).items() if isinstance(value, re.Pattern) and isinstance(value.pattern, str)
+    ]  # fmt: skip
+
+
 @contextlib.contextmanager
 def counted(meter: Meter) -> Iterator[None]:
     """The expressions of every module that sees a prompt are counted, and its lines."""
-    seen = ("language", "query", "serve", "node", "viewer", "mcp")
-    modules = [
-        module for name, module in sys.modules.items() if name.startswith(tuple(f"perception.{s}" for s in seen))
-    ]
     before = sys.gettrace()
     with pytest.MonkeyPatch.context() as patch:
-        for module in modules:
-            for name, value in list(vars(module).items()):
-                if isinstance(value, re.Pattern) and isinstance(value.pattern, str):
-                    patch.setattr(module, name, Counted(value, meter.step))
+        for module, name, value in expressions(len(sys.modules)):
+            patch.setattr(module, name, Counted(value, meter.step))
         sys.settrace(meter.trace)
         try:
             yield

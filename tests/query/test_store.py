@@ -107,7 +107,7 @@ def told(hit: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize("text", PROMPTS)
 def test_a_store_answers_as_its_maps_do_one_by_one(store: Path, maps: list[Path], text: str) -> None:
-    many = load_map(store, encoders)
+    many = opened(store, encoders)
     for least in (None, 0.0):
         hits, alone = many.query(text, 1000, least), one_by_one(maps, text, 1000, least)
         assert {(hit.map, hit.instance_id) for hit in hits} == alone.keys() and len(hits) == len(alone)
@@ -117,7 +117,7 @@ def test_a_store_answers_as_its_maps_do_one_by_one(store: Path, maps: list[Path]
             assert hit.score == pytest.approx(own.score, abs=SAME)
             assert told(hit) == told(own) and np.array_equal(hit.points, own.points)
             assert np.array_equal(hit.colors(), own.colors())
-            assert (hit.frame, hit.metric) == ("map", load_map(hit.map).metric)
+            assert (hit.frame, hit.metric) == ("map", opened(Path(hit.map), encoders).metric)
         assert [hit.instance_id for hit in many.query(text, 2, least)] == [hit.instance_id for hit in hits[:2]]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -12,15 +13,22 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 
+@cache
+def typestore(ros1: bool):
+    """The messages of one ROS generation. It compiles how each is written once."""
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    if ros1:  # which its store leaves out
+        entries = "geometry_msgs/TransformStamped[] transforms\n"
+        store.register(get_types_from_msg(entries, "tf2_msgs/msg/TFMessage"))
+    return store
+
+
 class Recorder:
     """Writes messages of one ROS generation; kind: "ros1", "sqlite" or "mcap"."""
 
     def __init__(self, path: Path, kind: str) -> None:
         self.ros1 = kind == "ros1"
-        self.store = get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.ROS2_HUMBLE)
-        if self.ros1:  # which its store leaves out
-            entries = "geometry_msgs/TransformStamped[] transforms\n"
-            self.store.register(get_types_from_msg(entries, "tf2_msgs/msg/TFMessage"))
+        self.store = typestore(self.ros1)
         plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
         self.writer = Writer1(path) if self.ros1 else Writer2(path, version=9, storage_plugin=plugin)
         self.writer.open()

@@ -12,6 +12,13 @@ from typing import Any
 import numpy as np
 
 
+def rand_index(a: np.ndarray, b: np.ndarray) -> float:
+    """Scikit-learn's adjusted Rand index; only the process that asks for it loads the library."""
+    from sklearn.metrics import adjusted_rand_score
+
+    return float(adjusted_rand_score(a, b))
+
+
 @dataclass(frozen=True)
 class BlobScene:
     """gaussians: a Gaussians of N; views: TrainingViews with labels; truth [N] int32: the ball of each Gaussian."""

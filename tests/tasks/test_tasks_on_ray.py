@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import tempfile
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ from perception.errors import InputError
 from perception.progress import QUIET, Progress
 from perception.tasks.engine import Engine
 
-pytest.importorskip("ray")
+pytestmark = pytest.mark.skipif(find_spec("ray") is None, reason="ray is not installed")
 
 
 @pytest.mark.slow
