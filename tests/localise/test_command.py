@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import shutil
 import tempfile
@@ -57,8 +59,17 @@ def told(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, An
     return dict(json.loads(capsys.readouterr().out))
 
 
-def test_poses_as_json_and_as_a_file_in_the_maps_frame(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    facts = told(capsys, folder / "a.gsmap", folder / "new", folder / "other/elsewhere.png", "-o", folder / "out.json")
+@pytest.fixture(scope="module")
+def localised(folder: Path) -> dict[str, Any]:
+    """What is told of the new photos and the other; out.json has their poses."""
+    photos = [folder / "new", folder / "other/elsewhere.png", "-o", folder / "out.json"]
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        assert main(["localise", str(folder / "a.gsmap"), *map(str, photos), "--json"]) == 0
+    return dict(json.loads(out.getvalue()))
+
+
+def test_poses_as_json_and_as_a_file_in_the_maps_frame(folder: Path, localised: dict[str, Any]) -> None:
+    facts = localised
     assert [(photo["name"], photo["localised"]) for photo in facts["photos"]] == [
         ("0.png", True), ("1.png", True), ("elsewhere.png", False),
     ]  # fmt: skip
@@ -213,17 +224,15 @@ def test_poses_in_the_map_before_it_was_scaled_are_refused(folder: Path, tmp_pat
             in_map_frame(poses, {**info, **again}, gmap.views)
 
 
-def test_poses_in_another_map_are_refused_unless_that_is_the_input(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.usefixtures("localised")
+def test_poses_in_another_map_are_refused_unless_that_is_the_input(folder: Path, tmp_path: Path) -> None:
     """Another map of the same room and unit, half a metre aside; names, corrections and updates keep the frame."""
-    told(capsys, folder / "a.gsmap", folder / "new/0.png", "-o", tmp_path / "a.json")
     aside = np.eye(4)
     aside[0, 3] = 0.5
-    gmap, poses = read_map(folder / "a.gsmap"), tmp_path / "a.json"
+    gmap, poses = read_map(folder / "a.gsmap"), folder / "out.json"
     other = [moved(view, aside) for view in gmap.views]
     assert in_map_frame(poses, gmap.info, [*gmap.views, replace(gmap.views[0], visit=1)])  # type: ignore[call-arg]
-    with pytest.raises(InputError, match=r"a\.json: is in the frame of another map; run perception localise again"):
+    with pytest.raises(InputError, match=r"out\.json: is in the frame of another map; run perception localise again"):
         in_map_frame(poses, gmap.info, other)
     scene = read_transforms(poses, ReadOptions(tmp_path, cloud=(np.zeros((1, 3)), np.zeros((1, 3), np.uint8))))
     made_of_it = {**gmap.info, "scene": scene.report}

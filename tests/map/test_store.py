@@ -324,34 +324,42 @@ def test_another_process_is_refused_and_a_killed_one_is_not_in_the_way(copied: P
 
 def test_many_writers_at_once_lose_no_label(copied: Path) -> None:
     """Each of four processes sets its own label as soon as it may; in the end all four are there."""
-    code = (
-        "import sys, time\nfrom pathlib import Path\nfrom perception.errors import InputError\n"
+    code = (  # forks, so that all begin at once
+        "import os, sys, time\nfrom pathlib import Path\nfrom perception.errors import InputError\n"
         "from perception.map.write import set_labels\n"
-        "for attempt in range(2000):\n"
-        "    try:\n        set_labels(Path(sys.argv[1]), {int(sys.argv[2]): 'mine'}); break\n"
-        "    except InputError as error:\n        assert 'is writing' in str(error), error; time.sleep(0.005)\n"
+        "def label(k):\n"
+        "    for attempt in range(2000):\n"
+        "        try:\n            set_labels(Path(sys.argv[1]), {k: 'mine'}); os._exit(0)\n"
+        "        except InputError as error:\n            assert 'is writing' in str(error), error; time.sleep(0.005)\n"
+        "    sys.exit('never free')\n"
+        "writers = [os.fork() or label(k) for k in range(4)]\n"
+        "sys.exit(any([os.waitpid(writer, 0)[1] for writer in writers]))"
     )
-    writers = [subprocess.Popen([sys.executable, "-c", code, str(copied), str(k)], cwd=copied.parent) for k in range(4)]
-    assert [writer.wait(120) for writer in writers] == [0] * 4
+    subprocess.run([sys.executable, "-c", code, str(copied)], cwd=copied.parent, check=True, timeout=120)
     assert [entry["label"] for entry in read_map(copied).instances[:4]] == ["mine"] * 4
 
 
 def test_a_writer_killed_at_any_moment_leaves_a_map_that_opens(copied: Path) -> None:
     """SIGKILL while a process rewrites the map and its labels over and over; PERCEPTION_KILLS=100 for a longer run."""
-    code = (
-        "import sys; from pathlib import Path; from perception.map.write import read_map, set_labels, write_map\n"
-        "path = Path(sys.argv[1]); gmap = read_map(path); print('go', flush=True); n = 0\n"
-        "while True:\n    n += 1; write_map(path, gmap); set_labels(path, {0: f'n{n}'})\n"
+    code = (  # a writer for each line that it is sent
+        "import os, sys; from pathlib import Path; from perception.map.write import read_map, set_labels, write_map\n"
+        "path = Path(sys.argv[1])\n"
+        "for line in sys.stdin:\n"
+        "    if (writer := os.fork()):\n        os.waitpid(writer, 0); print('killed', flush=True); continue\n"
+        "    gmap, n = read_map(path), 0\n    print(os.getpid(), flush=True)\n"
+        "    while True:\n        n += 1; write_map(path, gmap); set_labels(path, {0: f'n{n}'})\n"
     )
-    means = read_map(copied).means
-    for delay in np.random.default_rng(0).uniform(0, 0.08, int(os.environ.get("PERCEPTION_KILLS", "4"))):
-        writer = subprocess.Popen([sys.executable, "-c", code, str(copied)], stdout=subprocess.PIPE, cwd=copied.parent)
-        assert writer.stdout is not None and writer.stdout.readline()
-        time.sleep(delay)
-        writer.kill()
-        writer.wait()
-        gmap = _recovered(copied)
-        assert np.array_equal(gmap.means, means)
+    means, pipes = read_map(copied).means, {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    command = [sys.executable, "-c", code, str(copied)]
+    with subprocess.Popen(command, cwd=copied.parent, text=True, bufsize=1, **pipes) as starter:
+        for delay in np.random.default_rng(0).uniform(0, 0.08, int(os.environ.get("PERCEPTION_KILLS", "4"))):
+            starter.stdin.write("\n")
+            writer = int(starter.stdout.readline())
+            time.sleep(delay)
+            os.kill(writer, signal.SIGKILL)
+            assert starter.stdout.readline() == "killed\n"
+            gmap = _recovered(copied)
+            assert np.array_equal(gmap.means, means)
     write_map(copied, gmap)
     assert [path.name for path in copied.parent.iterdir()] == ["a.gsmap"]
 

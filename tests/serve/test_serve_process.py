@@ -7,8 +7,6 @@ import http.client
 import json
 import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 import urllib.error
@@ -20,6 +18,7 @@ from typing import Any
 
 import pytest
 
+from perception.cli import main
 from support.processes import served, server
 from support.query_maps import NAMES, write_map_of
 from support.synthetic_map import write_synthetic_map
@@ -141,12 +140,12 @@ def test_a_header_after_an_answer_has_a_time_too(tmp_path: Path) -> None:
                 pass
 
 
-def test_a_port_in_use_is_told_before_the_map_is_opened(tmp_path: Path) -> None:
+def test_a_port_in_use_is_told_before_the_map_is_opened(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
-        command = [sys.executable, "-m", "perception.cli", "serve", str(tmp_path / "none.gsmap"), "--port", port]
-        done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
-    assert done.returncode == 2 and done.stderr.count("\n") == 1 and f"--port {port}: is in use" in done.stderr
+        assert main(["serve", str(tmp_path / "none.gsmap"), "--port", port]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1 and f"--port {port}: is in use" in told
 
 
 @pytest.mark.slow
