@@ -95,9 +95,8 @@ def test_no_folder_is_a_hall() -> None:
     assert lines["io"] < 1500
 
 
-@pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_files_stay_short(path: Path) -> None:
-    assert len(path.read_text(encoding="utf-8").splitlines()) <= 400
+def test_files_stay_short() -> None:
+    assert not [path for path in modules() if len(path.read_text(encoding="utf-8").splitlines()) > 400]
 
 
 HEAVY = {"torch", "pydantic", "pycolmap", "onnxruntime", "cv2", "scipy", "skimage", "sklearn", "numpy"}

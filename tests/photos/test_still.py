@@ -79,8 +79,8 @@ def test_a_thing_pasted_over_moving_pictures_is_covered(wall: np.ndarray, thing,
 
 
 def test_a_moving_camera_alone_finds_nothing(wall: np.ndarray) -> None:
-    for count in (5, 8, 16, 40):
-        for seed in range(4):
+    for count, seeds in ((5, 4), (8, 4), (16, 4), (40, 1)):
+        for seed in range(seeds):
             assert not still_pixels(walk(wall, count, seed)).any()
 
 

@@ -285,11 +285,11 @@ def test_two_places_are_told_apart(tmp_path):
     if not data:
         pytest.skip("PERCEPTION_DATA is not set")
     (tmp_path / "photos").mkdir()
-    for place, most in (("fox_480", 24), ("tabletop_a", 16)):
+    for place, most in (("fox_480", 12), ("tabletop_a", 8)):
         for photo in sorted((Path(data) / place / "images").iterdir())[:most]:
             (tmp_path / "photos" / f"{place}-{photo.name}").symlink_to(photo)
     scene = load_scene(tmp_path / "photos", ReadOptions(tmp_path / "work"))
-    assert scene.report["models"] == [24, 16]
-    assert any("2 unconnected models (24, 16); the largest is mapped" in told for told in scene.report["warnings"])
+    assert scene.report["models"] == [12, 8]
+    assert any("2 unconnected models (12, 8); the largest is mapped" in told for told in scene.report["warnings"])
     assert {view.name.partition("-")[0] for view in scene.views} == {"fox_480"}
     assert {entry["name"].partition("-")[0] for entry in scene.report["left_out"]} == {"tabletop_a"}
