@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import io
 import os
 import re
@@ -51,10 +52,13 @@ def arguments(command: str) -> list[str]:
     return [*words, "--help"] if len(words) == 1 else words
 
 
+parser = functools.cache(build_parser)
+
+
 @pytest.mark.parametrize(("page", "command"), documented(), ids=lambda value: str(value)[:60])
 def test_documented_commands_are_understood(page: str, command: str, capsys: pytest.CaptureFixture[str]) -> None:
     try:
-        build_parser().parse_args(arguments(command))
+        parser().parse_args(arguments(command))
     except SystemExit as done:  # --help
         assert done.code == 0
 
