@@ -13,6 +13,7 @@ from perception.errors import InputError
 from perception.inputs.load import PhotoSizes, photo_sizes
 from perception.pipeline import estimate as module
 from perception.pipeline.estimate import check_memory, check_size, log_estimate, needed_bytes
+from support.given_poses import SIZE, transforms
 
 GIB = 2**30
 
@@ -61,9 +62,9 @@ def test_the_line_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         log_estimate(tmp_path, load_config(None, []), lines.append)
 
 
-def test_sizes_of_posed_inputs(small_scene: Path) -> None:
-    found = photo_sizes(small_scene)
-    assert found == photo_sizes(small_scene / "transforms.json") == PhotoSizes([(128, 96)] * 12, "12 photos")
+def test_sizes_of_posed_inputs(tmp_path: Path) -> None:
+    transforms(tmp_path)
+    assert photo_sizes(tmp_path) == photo_sizes(tmp_path / "transforms.json") == PhotoSizes([SIZE] * 8, "8 photos")
 
 
 @pytest.mark.parametrize(("size", "least"), [((270, 480), 20), ((640, 480), 15), ((4000, 1000), 44)])
