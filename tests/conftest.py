@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,6 +20,25 @@ _HOMES = [Path(perception.__file__).resolve().parents[1], _TESTS, _TESTS.parent 
 os.environ["PYTHONPATH"] = os.pathsep.join(map(str, _HOMES))
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
+
+
+SLOW = 20
+"""Quick tests that one slow test counts for, about, where files are put in order."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if hasattr(config.option, "loadscopereorder"):  # of pytest-xdist, which would put files of one slow test last
+        config.option.loadscopereorder = False
+
+
+@pytest.hookimpl(trylast=True)  # of those that -m leaves
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Under pytest-xdist long files come first, so that at the end no process waits long for another."""
+    if hasattr(config, "workerinput"):
+        weight = Counter[Path]()
+        for item in items:
+            weight[item.path] += SLOW if item.get_closest_marker("slow") else 1
+        items.sort(key=lambda item: -weight[item.path])
 
 
 @pytest.fixture
