@@ -114,8 +114,8 @@ def _view(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     port = viewer.address.rpartition(":")[2]
     shown = viewer.url if token is None else f"{viewer.address}/?token=CONTENT-OF-{args.token_file.name}"
     hint = f"; over SSH: ssh -L {port}:localhost:{port} THIS-MACHINE, then open it there"
-    print(f"{args.map}: open {shown} in a browser{hint}. Ctrl-C ends.", file=sys.stderr, flush=True)
     try:
+        print(f"{args.map}: open {shown} in a browser{hint}. Ctrl-C ends.", file=sys.stderr, flush=True)
         threading.Event().wait()
     except KeyboardInterrupt:
         viewer.stop()
