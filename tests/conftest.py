@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +19,10 @@ import perception
 _TESTS = Path(__file__).resolve().parent
 _HOMES = [Path(perception.__file__).resolve().parents[1], _TESTS, _TESTS.parent / "tools"]
 os.environ["PYTHONPATH"] = os.pathsep.join(map(str, _HOMES))
+# Compiled files are kept in __pycache__, which git ignores, also where PYTHONDONTWRITEBYTECODE is set, as in many a
+# container: else every process compiles all tests and the package anew, which is half of collecting.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 
