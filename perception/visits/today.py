@@ -1,6 +1,6 @@
 """What stands where today, from the photos of a visit beside the map, in this order:
 
-gone       which of the map's instances the photos contradict                        `_signs`, `_gone`
+gone       what of the map the photos contradict: instances, and Gaussians of none   `_signs`, `_gone`, `ghosts`
 grown      what stays, and new Gaussians where the photos show another surface       `_grown`
 things     of the new ones those in no instance's masks, grouped                     `_grouped`, `_true`
 pairs      which thing is which gone one, and how it moved; pieces of moved ones     `_moved`, `_apart`, `_pieces`
@@ -25,6 +25,7 @@ from perception.map.history import is_removed
 from perception.map.map import Map
 from perception.visits.colours import in_grey, looks_alike
 from perception.visits.evidence import Signs, in_free_space, looked_at, seen_rows, signs_of
+from perception.visits.ghosts import ghosts
 from perception.visits.growth import GROWING, SETTLING, grouped, joined_instances, new_surface, trained
 from perception.visits.look import Look
 from perception.visits.motion import ALIKE, CERTAIN, CLOSE, TWINS, Motion, assigned, motion_between
@@ -87,7 +88,8 @@ def seen_today(visit: Visit) -> Today:
         before = visit.looks(visit.gaussians, visit.ids)
         signs = _signs(visit, before)
         gone, haze = _gone(visit, before, signs)
-    stays = ~np.isin(visit.ids, gone) & ~haze
+        stays = ~np.isin(visit.ids, gone) & ~haze
+        stays &= ~ghosts(visit, before, stays)
     grown, record = _grown(visit, stays, gone)
     with run.stage("instances"):
         owned, things = _grouped(visit, grown, visit.rows[stays])
@@ -154,7 +156,7 @@ def _grown(visit: Visit, stays: np.ndarray, gone: list[int]) -> tuple[Gaussians,
     run.progress.log(f"{len(gone)} things do not stand where they stood; {len(new)} points of new surface")
     if not len(new):
         return held, TrainRecord()
-    memory = visit.rehearsed(held, Gaussians.concatenate([visit.part(np.isin(visit.ids, gone)), new]))
+    memory = visit.rehearsed(held, Gaussians.concatenate([visit.part(~stays), new]))
     return trained(visit, "grow", GROWING, Gaussians.concatenate([held, new]), len(held), memory)
 
 
@@ -324,8 +326,9 @@ def _settled(
     together = today.gaussians
     start = together.sh[: len(kept)].clone()
     came = np.append(np.isin(stays, new), np.ones(len(together) - len(stays), bool))
-    others = [visit.part(np.isin(visit.ids, gone)), together.rows(torch.from_numpy(np.flatnonzero(came)))]
-    memory = visit.rehearsed(visit.part(np.isin(visit.rows, kept)), Gaussians.concatenate(others))
+    stood = np.isin(visit.rows, kept)
+    others = [visit.part(~stood), together.rows(torch.from_numpy(np.flatnonzero(came)))]
+    memory = visit.rehearsed(visit.part(stood), Gaussians.concatenate(others))
     final, record = trained(visit, "settle", SETTLING, together, len(together), memory, alone)
     unseen = (final.sh[: len(kept)] == start).flatten(1).all(dim=1)
     final = in_grey(final) if visit.grey else final

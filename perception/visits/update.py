@@ -2,7 +2,7 @@
 
 poses      of the photos in the map's frame, given or localised                           `scene`, `placing`
 look       exposure, stereo depth and masks of the photos; the map's render beside them   `visit`, `look`
-evidence   from both: things that stand where they stood, do not, or are in no photo      `evidence`
+evidence   from both: things that stand where they stood, do not, or are in no photo      `evidence`, `ghosts`
 grow       from what stays: new Gaussians where the photos show another surface           `growth`, `carving`
 motion     from what grew: which new thing is which one that is gone, and how it moved    `motion`, `registration`
 settle     colours of all that was looked at; a moved thing keeps its own Gaussians       `growth`, `rehearsal`
