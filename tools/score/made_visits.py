@@ -2,7 +2,7 @@
 
 python tools score.made_visits tabletop|room WORK --seeds N ... [--visits N] [--side PX] [--views N]
     [--share KIND=X ...] [--corner SHARE] [--masks labels|labels_sam|builtin] [--alone] [--apart] [--back]
-    [--grey] [--set KEY=VALUE ...]
+    [--grey] [--unlabelled] [--set KEY=VALUE ...]
 
 Makes the visits of `worlds.visits` (400 × 300 pixels, 36 or 56 photos), the map of the first one (1000 iterations,
 without language), and updates it visit after visit. A row for each visit, then mean, spread and range over all of them,
@@ -10,7 +10,9 @@ and what came true of the states, by confidence. Given poses, unless --alone. --
 (moved, turned, removed, added, swapped); none=0: only the light changes. --corner: later visits use that share of their
 photos, the first ones by name. --grey: their photos have no colours. --apart: also a new map of every visit, for its
 PSNR and its CPU seconds. --back: then a visit that finds the place as the first one did; `back` is the share of the
-things said to be removed that have their ids again where they stood.
+things said to be removed that have their ids again where they stood. --unlabelled: label images of the first visit lack
+all things that go or move, and every other one that stays: `ghosts` is the share of the Gaussians of those that is left
+where nothing stands now, `lost` the share that went of those where something does.
 """
 
 from __future__ import annotations
@@ -42,9 +44,12 @@ SETTINGS = ("train.iterations=1000", "language.encoder=none", "language.texts=of
 BINS = (0.0, 0.6, 0.8, 0.9, 0.97, 1.0)
 """Of confidence."""
 COLUMNS = ("f1", "false_alarms", "unseen_called_removed", "motion_cm", "nearest_cm", "motion_degrees", "turns_unknown",
-           "ids_kept", "back", "off_cm", "gaussians", "psnr", "new_psnr", "cpu", "new_cpu")  # fmt: skip
+           "ids_kept", "back", "ghosts", "lost", "off_cm", "gaussians", "psnr", "new_psnr", "cpu",
+           "new_cpu")  # fmt: skip
 NEAR = 0.05
 """Metres from where a thing stood within which it is back."""
+BESIDE = 0.03
+"""Metres from a true point within which a Gaussian is of its thing."""
 T = TypeVar("T")
 
 
@@ -84,18 +89,49 @@ def grey(folder: Path) -> Path:
     return copy
 
 
+def unlabelled(folder: Path, masks: str) -> Path:
+    """Label images of visit 0 without the things that go or move, and without every other one that stays."""
+    entries = Truth.read(folder / "visit0", folder / "visit1").entries
+    stays = [i for i, entry in entries.items() if entry["state"] == "unchanged"]
+    unknown, made = sorted(set(entries) - set(stays[1::2])), folder / f"{masks}-unlabelled"
+    made.mkdir(exist_ok=True)
+    for file in sorted((folder / "visit0" / masks).iterdir()):
+        with Image.open(file) as image, Image.open(folder / "visit0" / "masks_gt" / file.name) as true:
+            labels, ids = np.array(image), np.array(true)
+        Image.fromarray(np.where(np.isin(ids, unknown), 0, labels).astype(np.uint16)).save(made / file.name)
+    return made
+
+
+def left(before: Map, today: Map, truth: Truth) -> dict[str, float]:
+    """Shares of the Gaussians of no instance that is gone: `ghosts`, left of those of a thing that went, where nothing
+    stands now; `lost`, of those where something stands."""
+    from scipy.spatial import cKDTree
+
+    went = [i for i, entry in truth.entries.items() if entry["state"] in ("moved", "removed", "replaced")]
+    away, nearest = cKDTree(truth.points[0]).query(before.means)
+    now = cKDTree(truth.points[1]).query(before.means)[0]
+    gone = [entry["id"] for entry in today.instances if entry.get("state") in ("moved", "removed")]
+    rows, held = {mean.tobytes() for mean in today.means}, ~np.isin(before.instance_ids, gone)
+    stays = np.array([mean.tobytes() in rows for mean in before.means])
+    ghost = held & (away < BESIDE) & np.isin(truth.ids[0][nearest], went) & (now > NEAR)
+    return {"ghosts": float(stays[ghost].mean()), "lost": 1 - float(stays[held & (now < BESIDE)].mean())}
+
+
 def scored(folder: Path, given: argparse.Namespace) -> list[dict[str, Any]]:
     """A row for each visit but the first."""
     pairs = [*SETTINGS, *given.pairs]
 
     def masks(visit: Path) -> str:
+        if given.unlabelled and visit.name == "visit0":
+            return f"masks=labels:{unlabelled(folder, given.masks)}"
         return "masks=builtin" if given.masks == "builtin" else f"masks=labels:{visit / given.masks}"
 
     def new_map(visit: Path, output: Path) -> tuple[Map, float]:
         return timed(partial(build_map, visit, output, load_config(None, [*pairs, masks(visit)])))
 
-    name, rows = f"{given.masks}{'-alone' if given.alone else ''}", []
-    path = folder / f"map-{given.masks}.gsmap"
+    known = f"{given.masks}{'-unlabelled' if given.unlabelled else ''}"
+    name, rows = f"{known}{'-alone' if given.alone else ''}", []
+    path = folder / f"map-{known}.gsmap"
     start = (read_map(path), float("nan")) if path.exists() else new_map(folder / "visit0", path)
     for number in range(1, given.visits):
         before, visit = read_map(path), folder / f"visit{number}"
@@ -109,11 +145,12 @@ def scored(folder: Path, given: argparse.Namespace) -> list[dict[str, Any]]:
         row = scores(told, before, today, truth)
         row |= {"gaussians": len(today), "off_cm": off_cm(today, truth), "psnr": today.info["quality"].get("psnr")}
         row |= {"cpu": seconds, "new_cpu": start[1], "parts": today.info["seconds"]}
+        row |= left(before, today, truth) if given.unlabelled else {}
         if given.apart:
             apart, row["new_cpu"] = new_map(visit, folder / f"apart-{given.masks}-{number}.gsmap")
             row["new_psnr"] = apart.info["quality"].get("psnr")
         if given.back and number == given.visits - 1:
-            row["back"] = came_back(folder, folder / f"map-{given.masks}.gsmap", path, masks)
+            row["back"] = came_back(folder, folder / f"map-{known}.gsmap", path, masks)
         rows.append(row)
         show(f"{folder.name}, visit {number}", row)
     return rows
@@ -171,7 +208,7 @@ def main() -> None:
     parser.add_argument("--share", nargs="+", default=[])
     parser.add_argument("--corner", type=float, default=1.0)
     parser.add_argument("--masks", choices=("labels", "labels_sam", "builtin"), default="labels")
-    for flag in ("--alone", "--apart", "--back", "--grey"):
+    for flag in ("--alone", "--apart", "--back", "--grey", "--unlabelled"):
         parser.add_argument(flag, action="store_true")
     parser.add_argument("--set", action="append", default=[], dest="pairs")
     given = parser.parse_args()
