@@ -36,7 +36,7 @@ from perception.map.write import Map, read_map
 from perception.pipeline.mapping import build_map
 from perception.visits.scene import update_settings
 from perception.visits.update import update_map
-from score.visits import Truth, owners, scores
+from score.visits import Truth, kept, owners, scores
 from worlds.visits import SHARE, make_visits
 
 VIEWS = {"tabletop": 36, "room": 56}
@@ -111,8 +111,7 @@ def left(before: Map, today: Map, truth: Truth) -> dict[str, float]:
     away, nearest = cKDTree(truth.points[0]).query(before.means)
     now = cKDTree(truth.points[1]).query(before.means)[0]
     gone = [entry["id"] for entry in today.instances if entry.get("state") in ("moved", "removed")]
-    rows, held = {mean.tobytes() for mean in today.means}, ~np.isin(before.instance_ids, gone)
-    stays = np.array([mean.tobytes() in rows for mean in before.means])
+    stays, held = kept(before, today), ~np.isin(before.instance_ids, gone)
     ghost = held & (away < BESIDE) & np.isin(truth.ids[0][nearest], went) & (now > NEAR)
     return {"ghosts": float(stays[ghost].mean()), "lost": 1 - float(stays[held & (now < BESIDE)].mean())}
 

@@ -4,8 +4,8 @@ python tools score.unchanged WORK SCENE ... [--stretch N] [--set KEY=VALUE ...]
 
 SCENE: a folder with a transforms.json, of real photos too. Of its photos, by name, every other stretch of N (5) is the
 visit; the map of the others is made in WORK with the built-in masks and without language, and kept. Everything that the
-update says to have moved, gone or come is an error. A row for each scene, with the PSNR of held-out photos of the
-visit, and of those of the map, each in its own light, before and after the update.
+update says to have moved, gone or come is an error. A row for each scene, with the Gaussians that left, the PSNR of
+held-out photos of the visit, and of those of the map, each in its own light, before and after the update.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from perception.pipeline.mapping import build_map
 from perception.progress import Progress
 from perception.visits.scene import update_settings
 from perception.visits.update import update_map
+from score.visits import kept
 
 SETTINGS = ("masks=builtin", "language.encoder=none", "language.texts=off", "photos.max_side=480")
 FILES = ("file_path", "mask_path", "depth_file_path", "ply_file_path")
@@ -85,7 +86,8 @@ def main() -> None:
         counts = ", ".join(f"{states.count(state)} {state}" for state in ("moved", "removed", "added", "unseen"))
         things = len(states) - states.count("added")
         views = f"{gmap.info['quality'].get('psnr', 0):.2f} dB, of the map {shown(old):.2f} and {shown(gmap):.2f} dB"
-        print(f"{scene.name}: {counts} of {things} instances; {views}", flush=True)
+        left = f"{np.sum(~kept(old, gmap))} of {len(old)} Gaussians left"
+        print(f"{scene.name}: {counts} of {things} instances; {left}; {views}", flush=True)
 
 
 if __name__ == "__main__":

@@ -90,6 +90,12 @@ def owners(gmap: Map, points: np.ndarray, true: np.ndarray) -> tuple[dict[int, i
     return found, most
 
 
+def kept(before: Map, after: Map) -> np.ndarray:
+    """[N] bool: Gaussians of a map that an update left where they were."""
+    means = {mean.tobytes() for mean in after.means}
+    return np.array([mean.tobytes() in means for mean in before.means], bool)
+
+
 def scores(changes: list[dict[str, Any]], first: Map, second: Map, truth: Truth) -> dict[str, Any]:
     """Precision, recall and F1 of each state; false alarms, unseen things called removed, errors of motions, ids."""
     before, most_before = owners(first, truth.points[0], truth.ids[0])
