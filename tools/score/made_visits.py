@@ -11,8 +11,8 @@ and what came true of the states, by confidence. Given poses, unless --alone. --
 photos, the first ones by name. --grey: their photos have no colours. --apart: also a new map of every visit, for its
 PSNR and its CPU seconds. --back: then a visit that finds the place as the first one did; `back` is the share of the
 things said to be removed that have their ids again where they stood. --unlabelled: label images of the first visit lack
-all things that go or move, and every other one that stays: `ghosts` is the share of the Gaussians of those that is left
-where nothing stands now, `lost` the share that went of those where something does.
+all things that go or move, and every other one that stays: `ghosts` is the share left of the Gaussians of what went,
+`lost` the share that went of those of what stands.
 """
 
 from __future__ import annotations
@@ -103,17 +103,18 @@ def unlabelled(folder: Path, masks: str) -> Path:
 
 
 def left(before: Map, today: Map, truth: Truth) -> dict[str, float]:
-    """Shares of the Gaussians of no instance that is gone: `ghosts`, left of those of a thing that went, where nothing
-    stands now; `lost`, of those where something stands."""
+    """Of the Gaussians of no instance that is said to be gone: the share left, `ghosts`, of those of things that went,
+    where nothing stands now; the share that went, `lost`, of those of what stands."""
     from scipy.spatial import cKDTree
 
     went = [i for i, entry in truth.entries.items() if entry["state"] in ("moved", "removed", "replaced")]
     away, nearest = cKDTree(truth.points[0]).query(before.means)
     now = cKDTree(truth.points[1]).query(before.means)[0]
     gone = [entry["id"] for entry in today.instances if entry.get("state") in ("moved", "removed")]
-    stays, held = kept(before, today), ~np.isin(before.instance_ids, gone)
-    ghost = held & (away < BESIDE) & np.isin(truth.ids[0][nearest], went) & (now > NEAR)
-    return {"ghosts": float(stays[ghost].mean()), "lost": 1 - float(stays[held & (now < BESIDE)].mean())}
+    stays, held = kept(before, today), ~np.isin(before.instance_ids, gone) & (away < BESIDE)
+    other = np.isin(truth.ids[0][nearest], went)
+    ghost, stood = held & other & (now > NEAR), held & ~other & (now < BESIDE)
+    return {"ghosts": float(stays[ghost].mean()), "lost": 1 - float(stays[stood].mean())}
 
 
 def scored(folder: Path, given: argparse.Namespace) -> list[dict[str, Any]]:
