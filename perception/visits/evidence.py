@@ -177,11 +177,16 @@ def seen_rows(looks: Sequence[Look], means: np.ndarray, scales: np.ndarray) -> n
     seen = np.zeros(len(means), bool)
     for shown in looks:
         inside, (row, column), z = shown.view.seen(means)
-        mapped, measured = shown.mapped[row, column], shown.measured[row, column]
-        limit = (1 + AGREE) * mapped + 2 * scales[inside]
+        measured = shown.measured[row, column]
         free = (measured == 0) | (measured > (1 - 2 * AGREE) * z[inside] - 2 * scales[inside])
-        seen[inside[(mapped > 0) & (z[inside] <= limit) & free]] = True
+        seen[inside[at_surface(shown.mapped[row, column], z[inside], scales[inside]) & free]] = True
     return seen
+
+
+def at_surface(mapped: np.ndarray, z: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    """[N] bool: Gaussians (depths z [N], largest scales [N]) whose centre is not behind the map's surface where they
+    lie in a picture, at depths mapped [N], 0 = none."""
+    return (mapped > 0) & (z <= (1 + AGREE) * mapped + 2 * scales)
 
 
 def in_free_space(looks: Sequence[Look], means: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 import torch
 
-from perception.gaussians.model import Gaussians, Nearby, as_gaussians
+from perception.gaussians.model import Gaussians, Nearby
 from perception.gaussians.state import TrainRecord
 from perception.instances.group import Grouping
 from perception.instances.votes import mask_votes
@@ -68,10 +68,12 @@ Pairs = dict[int, tuple[int, Motion]]
 
 @dataclass
 class Today:
-    """What stands where today. owned: the Gaussians, of which the first are the rows `kept` [H] of the map; signs of
-    the map's instances, in their order; `gone`: ids of those that do not stand where they stood; motions by id;
-    `added`: of the new ones, by id, the score and how it is new."""
+    """What stands where today. rest [Q]: rows of the map that stay and no photo shows; owned: all other Gaussians, of
+    which the first are the rows `kept` [H] of the map; signs of the map's instances, in their order; `gone`: ids of
+    those that do not stand where they stood; motions by id; `added`: of the new ones, by id, the score and how it is
+    new."""
 
+    rest: np.ndarray
     owned: Owned
     kept: np.ndarray
     signs: list[Signs]
@@ -88,8 +90,10 @@ def seen_today(visit: Visit) -> Today:
         before = visit.looks(visit.gaussians, visit.ids)
         signs = _signs(visit, before)
         gone, haze = _gone(visit, before, signs)
-        stays = ~np.isin(visit.ids, gone) & ~haze
-        stays &= ~ghosts(visit, before, stays)
+        leaves = np.isin(gmap.instance_ids, gone)
+        leaves[visit.rows[haze | ghosts(visit, before, ~leaves[visit.rows] & ~haze)]] = True
+        visit = visit.without(leaves)
+    stays = ~leaves[visit.rows]
     grown, record = _grown(visit, stays, gone)
     with run.stage("instances"):
         owned, things = _grouped(visit, grown, visit.rows[stays])
@@ -104,20 +108,19 @@ def seen_today(visit: Visit) -> Today:
         taken = {j for j, _ in pairs.values()} | pieces
     start = np.count_nonzero(stays)
     fresh = np.arange(start, len(grown))
-    looked, through = looked_at(as_gaussians(gmap), gmap.views, grown.means[fresh].double().numpy())
+    looked, through = looked_at(visit.whole, visit.near, grown.means[fresh].double().numpy())
     added = _added(gmap, things, known, taken, np.append(np.ones(start, bool), looked))
     for i, (j, _) in added.items():
         owned.ids[things[j][0]] = i
     own = np.isin(fresh, _rows(things))
     owned.membership[fresh[~own & (owned.ids[fresh] < 0)]] = 0
     # Other new surface through which earlier photos saw stands where nothing did: an error.
-    leaves = np.append(_rows([things[j] for j in taken]), fresh[through & ~own])
-    final, kept, last = _settled(
-        visit, owned, visit.rows[stays], leaves, fresh[own], pairs, gone, not record.iterations
-    )
+    wrong = np.append(_rows([things[j] for j in taken]), fresh[through & ~own])
+    kept, rest = visit.rows[stays], np.setdiff1d(np.flatnonzero(~leaves), visit.rows)
+    final, last = _settled(visit, owned, kept, wrong, fresh[own], pairs, gone, not record.iterations)
     scores: dict[int, tuple[float, New]] = {i: (things[j][1], new) for i, (j, new) in added.items()}
     motions = {i: motion for i, (_, motion) in pairs.items()}
-    return Today(final, kept, signs, gone, motions, scores, TrainRecord.joined([record, last], "leg"))
+    return Today(rest, final, kept, signs, gone, motions, scores, TrainRecord.joined([record, last], "leg"))
 
 
 def _rows(things: Sequence[Thing]) -> np.ndarray:
@@ -309,11 +312,10 @@ def _settled(
     pairs: Pairs,
     gone: list[int],
     alone: bool,
-) -> tuple[Owned, np.ndarray, TrainRecord]:
-    """All Gaussians of today and the rows of the map that the first ones are: what no photo may show, what stays of
-    `owned`, whose first rows are the rows `kept` [H] of the map, without the rows `leaves`, and the moved things with
-    their own Gaussians. The colours of all that was looked at are trained. new: rows of the new things; alone: whether
-    this is the only training."""
+) -> tuple[Owned, TrainRecord]:
+    """The Gaussians of today that photos show: what stays of `owned`, whose first rows are the rows `kept` [H] of the
+    map, without the rows `leaves`, and the moved things with their own Gaussians. The colours of all that was looked at
+    are trained. new: rows of the new things; alone: whether this is the only training."""
     gmap = visit.gmap
     stays = np.setdiff1d(np.arange(len(owned.gaussians)), leaves)
     parts = [owned.rows(stays)]
@@ -335,5 +337,4 @@ def _settled(
     final.sh[:, 0] += torch.cat(hues)
     original = torch.from_numpy(gmap.sh[kept])
     final.sh[: len(kept)] = torch.where(unseen[:, None, None], original, final.sh[: len(kept)])
-    rest = np.setdiff1d(np.flatnonzero(~np.isin(gmap.instance_ids, gone)), visit.rows)  # no photo may show these
-    return Owned.concatenate([visit.owned(rest), replace(today, gaussians=final)]), np.append(rest, kept), record
+    return replace(today, gaussians=final), record

@@ -52,7 +52,7 @@ from perception.visits.record import (
     with_parts,
 )
 from perception.visits.today import Today, seen_today
-from perception.visits.visit import Visit, open_visit
+from perception.visits.visit import Owned, Visit, open_visit
 
 
 def update_map(
@@ -66,7 +66,7 @@ def update_map(
 ) -> Map:
     """Writes the map of today to `output`: the map at `path`, changed as the photos of `source` show.
 
-    config: settings, usually those of the map (`update_settings`). Gaussians that lie in no photo stay as they are, bit
+    config: settings, usually those of the map (`update_settings`). Gaussians that no photo shows stay as they are, bit
     for bit; of the others that stay, colours alone are trained, on the photos and on renders of what earlier visits saw
     (`rehearsal`). Ids, names and the frame are kept. What a run has made is kept beside `output` until the map is
     written; `resume` goes on from there. InputError for bad input: another scene, another unit, photos older than the
@@ -132,14 +132,15 @@ def _described(visit: Visit, today: Today, encoder: Encoder | None) -> Described
 
 def assembled(visit: Visit, today: Today, described: DescribedInstances, output: Path, mark: str) -> Map:
     """The map of today."""
-    gmap, run, number, prefix, owned = visit.gmap, visit.run, visit.number, _prefix(visit), today.owned
-    instances = _entries(visit, today, described)
+    gmap, run, number, prefix = visit.gmap, visit.run, visit.number, _prefix(visit)
     with run.stage("score"):
-        seen = in_grey(owned.gaussians) if visit.grey else owned.gaussians
+        seen = in_grey(today.owned.gaussians) if visit.grey else today.owned.gaussians
         quality = score_views(seen, visit.photos.held, gmap.metric)
         quality["views"] = {prefix + name: figures for name, figures in quality["views"].items()}
+    owned = Owned.concatenate([visit.owned(today.rest), today.owned])
+    instances = _entries(visit, today, owned, described)
     arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in owned.gaussians.named().items()}
-    fresh = slice(len(today.kept), None)
+    fresh = slice(len(today.rest) + len(today.kept), None)
     norm = np.linalg.norm(arrays["quats"][fresh], axis=1, keepdims=True)
     arrays["quats"][fresh] = arrays["quats"][fresh] / np.maximum(norm, 1e-12)
     groups = dict(gmap.groups)
@@ -180,9 +181,9 @@ def assembled(visit: Visit, today: Today, described: DescribedInstances, output:
     )
 
 
-def _entries(visit: Visit, today: Today, described: DescribedInstances) -> list[dict[str, Any]]:
-    """The entries of the map's instances after the visit, then those of the new ones."""
-    number, owned, made = visit.number, today.owned, []
+def _entries(visit: Visit, today: Today, owned: Owned, described: DescribedInstances) -> list[dict[str, Any]]:
+    """The entries of the map's instances after the visit, then those of the new ones. owned: all Gaussians."""
+    number, made = visit.number, []
     for entry, signs in zip(visit.gmap.instances, today.signs, strict=True):
         motion, rows = today.motions.get(entry["id"]), np.flatnonzero(owned.ids == entry["id"])
         entry = recorded(entry, number, signs, motion, entry["id"] in today.gone)

@@ -28,7 +28,6 @@ from perception.visits.look import (
     Look,
     compared,
     depth_at,
-    in_view,
     look,
     seen_from,
     stereo_of,
@@ -37,8 +36,12 @@ from perception.visits.look import (
 from perception.visits.placing import checked_poses
 from perception.visits.record import as_it_was
 from perception.visits.registration import compact
-from perception.visits.rehearsal import rehearsed, showing
+from perception.visits.rehearsal import rehearsed, showing, to_rehearse
+from perception.visits.rows import shape_of, shown_rows
 from perception.visits.scene import foreign_photos, refuse_older, visit_scene
+
+FAR = 0.98
+"""Quantile of the depths of a photo that tells how far it sees."""
 
 
 def gaussians_of(gmap: Map, rows: np.ndarray) -> Gaussians:
@@ -70,22 +73,26 @@ class Owned:
 
 @dataclass
 class Visit:
-    """The photos of a visit against the map. number: of the visit; rows [R]: of the map's Gaussians, those that a photo
-    may show; gaussians: these as the visit sees them (`seen`); light [3]: its colours over the map's; grey: whether
-    brightness alone is compared, as the photos or the map have no colours; photos: exposed and labelled; stereo: depths
-    of the training photos; earlier: views of earlier visits that show what these see; masks: report; mark: of its
-    training; left_out: names of photos that are not used, and why."""
+    """The photos of a visit against the map. number: of the visit; whole: the map's Gaussians, without features and
+    colours; rows [R]: those of them that a photo shows (`shown_rows`); gaussians: these as the visit sees them
+    (`seen`); light [3]: its colours over the map's; grey: whether brightness alone is compared, as the photos or the
+    map have no colours; photos: exposed and labelled; stereo: depths of the training photos; near: views of earlier
+    visits that show something of what these see; earlier: those to be rehearsed; beside [E]: rows that these show and
+    no photo does; masks: report; mark: of its training; left_out: names of photos that are not used, and why."""
 
     run: Run
     gmap: Map
     number: int
+    whole: Gaussians
     rows: np.ndarray
     gaussians: Gaussians
     light: np.ndarray
     grey: bool
     photos: Photos
     stereo: list[StereoView | None]
-    earlier: list[View]
+    near: list[View]
+    earlier: list[TrainingView]
+    beside: np.ndarray
     masks: dict[str, Any]
     mark: str
     left_out: list[dict[str, str]]
@@ -100,9 +107,18 @@ class Visit:
         return self.gaussians.rows(torch.from_numpy(np.flatnonzero(chosen)))
 
     def rehearsed(self, stays: Gaussians, others: Gaussians) -> list[TrainingView]:
-        """Renders of what earlier visits saw, as many as there are photos, see `rehearsal.rehearsed`."""
-        side, count = self.run.config.photos.max_side, len(self.photos.views)
-        return rehearsed(self.earlier, side, count, stays, others, self.run.new_keep())
+        """Renders of what earlier visits saw, see `rehearsal.rehearsed`, where nothing is that only they show."""
+        beside = gaussians_of(self.gmap, np.setdiff1d(self.beside, self.rows))
+        return rehearsed(self.earlier, stays, Gaussians.concatenate([others, beside]), self.run.new_keep())
+
+    def without(self, leaves: np.ndarray) -> Visit:
+        """The visit with what its photos show where the map's Gaussians `leaves` [N] bool do not stand, as well."""
+        if not leaves.any():
+            return self
+        stays = np.flatnonzero(~leaves)
+        left = self.whole.rows(torch.from_numpy(stays))
+        rows = np.union1d(self.rows, stays[shown_rows(left, [*self.photos.views, *self.photos.held])])
+        return replace(self, rows=rows, gaussians=self.seen(gaussians_of(self.gmap, rows)))
 
     def owned(self, rows: np.ndarray) -> Owned:
         """The rows [R] of the map, as it has them."""
@@ -173,7 +189,9 @@ def open_visit(run: Run, gmap: Map, source: MaskSource, output: Path) -> Visit:
     if scene.report.get("input") != "photos":
         with run.stage("poses"):
             photos = checked_poses(run, gmap, photos)
-    rows = np.flatnonzero(in_view(gmap.means, gmap.scales.max(axis=1), [*photos.views, *photos.held]))
+    with run.stage("look"):
+        whole = shape_of(gmap)
+        rows = np.flatnonzero(shown_rows(whole, [*photos.views, *photos.held]))
     old, ids = gaussians_of(gmap, rows), gmap.instance_ids[rows]
     if grey := without_colours(old, photos.views):
         run.progress.log("the photos or the map have no colours: brightness alone is compared")
@@ -186,17 +204,20 @@ def open_visit(run: Run, gmap: Map, source: MaskSource, output: Path) -> Visit:
         why = "does not show what the map holds there"
         left_out += _told(run, [{"name": name, "why": why} for name in foreign])
         run.progress.log(f"{len(photos.views)} photos of the visit; light {', '.join(f'{x:.2f}' for x in light)}")
+        run.progress.log(f"{len(rows)} of {len(gmap)} Gaussians are in the photos")
         stereo = stereo_of(photos.training, photos.views, shown, run.progress)
         seen = seen_rows(shown, lit.means.double().numpy(), lit.scales.max(dim=1).values.numpy())
-        earlier = showing(gmap.views, lit, seen)
+        seen = np.isin(np.arange(len(gmap)), rows[seen])
+        near = showing(gmap.views, whole, seen, max(float(np.quantile(each.mapped, FAR)) for each in shown))
+        earlier = to_rehearse(near, run.config.photos.max_side, len(photos.views))
+        beside = np.setdiff1d(np.flatnonzero(shown_rows(whole, earlier)), rows)
     depths = {view.name: each for view, each in zip(photos.training, stereo, strict=True)}
     photos, masks = label_photos(
         run, photos, source, lambda view: depth_at(depths[view.name], view.photo.shape, confirmed=False)
     )
     mark = digest(gmap.map_id, training_mark(run.source, run.config), source.identity)
-    return Visit(
-        run, gmap, gmap.newest_visit + 1, rows, lit, light, grey, photos, stereo, earlier, masks, mark, left_out
-    )
+    facts = rows, lit, light, grey, photos, stereo, [view for view, _ in near], earlier, beside, masks, mark, left_out
+    return Visit(run, gmap, gmap.newest_visit + 1, whole, *facts)
 
 
 def _told(run: Run, left_out: Sequence[dict[str, str]]) -> list[dict[str, str]]:

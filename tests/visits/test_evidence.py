@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +16,7 @@ from perception.types import View
 from perception.visits.evidence import in_free_space, looked_at, signs_of
 from perception.visits.look import Look, in_view
 from perception.visits.record import recorded, with_parts
-from perception.visits.rehearsal import rehearsed, showing
+from perception.visits.rehearsal import rehearsed, showing, to_rehearse
 
 SHAPE = 40, 50
 BOX = np.s_[10:30, 10:40]
@@ -160,8 +158,8 @@ def test_what_is_rehearsed_is_the_render_but_where_something_new_stands_or_stood
     """A ball of 0.1 before the wall and one behind it: pixels of the first do not count, nor those past the wall."""
     front, behind = (replace(wall().rows(torch.arange(1)), log_scales=torch.full((1, 3), -3.0)) for _ in range(2))
     front.means[:], behind.means[:] = torch.tensor([0.1, 0.0, 1.0]), torch.tensor([0.1, 0.0, 3.0])
-    both = rehearsed(VIEWS, 160, 9, wall(), Gaussians.concatenate([front, behind]))
-    plain = rehearsed(VIEWS, 160, 1, wall(), behind)
+    both = rehearsed(to_rehearse([(view, 1) for view in VIEWS], 160, 9), wall(), Gaussians.concatenate([front, behind]))
+    plain = rehearsed(to_rehearse([(view, 1) for view in VIEWS], 160, 1), wall(), behind)
     assert [view.name for view in both] == ["rehearsed -0.2", "rehearsed 0.2"] and len(plain) == 1
     row, column = np.mgrid[:120, :160] + 0.5
     for view, x in zip(both, (-0.2, 0.2), strict=True):
@@ -183,7 +181,10 @@ def test_renders_lie_in_the_memory_of_photos_with_the_same_bits(tmp_path: Path) 
         kept.append(arrays.keep(image))
         return kept[-1]
 
-    plain, bounded = (rehearsed(VIEWS, 160, 9, wall(), wall().rows(torch.arange(0)), *given) for given in ((), (keep,)))
+    plain, bounded = (
+        rehearsed(to_rehearse([(view, 1) for view in VIEWS], 160, 9), wall(), wall().rows(torch.arange(0)), *given)
+        for given in ((), (keep,))
+    )
     images = [image for view in bounded for image in (view.photo, view.weight)]
     assert all(np.shares_memory(image.numpy(), there) for image, there in zip(images, kept, strict=True))
     for view, other in zip(plain, bounded, strict=True):
@@ -197,9 +198,17 @@ def test_views_of_the_other_side_of_a_wall_are_not_rehearsed() -> None:
     behind = np.diag([-1.0, 1, -1, 1])
     behind[:3, 3] = -behind[:3, :3] @ [0, 0, 4.0]
     away = replace(VIEWS[0], camera_from_world=np.diag([-1.0, 1, -1, 1]))
-    held: Any = SimpleNamespace(held_out=True)
-    views = [*VIEWS, replace(VIEWS[0], camera_from_world=behind), away, held]
-    assert showing(views, both, np.arange(len(both)) >= len(wall())) == VIEWS
+    held = replace(VIEWS[0], held_out=True)
+    back = np.eye(4)
+    back[2, 3] = 9
+    far = replace(VIEWS[0], camera_from_world=back)
+    views = [*VIEWS, replace(VIEWS[0], camera_from_world=behind), away, held, far]
+    seen = np.arange(len(both)) >= len(wall())
+    shown = showing(views, both, seen, 5.0)
+    assert showing(views, both, seen, 12.0)[:-1] == shown and showing(views, both, seen, 0.1) == []
+    assert [view for view, _ in shown] == [*VIEWS, held]
+    few = shown[0][0], 0.05 * shown[0][1]
+    assert [view.name for view in to_rehearse([few, *shown[1:]], 160, 9)] == [f"rehearsed {VIEWS[1].name}"]
 
 
 def test_what_two_photos_see_through_is_free_space() -> None:
