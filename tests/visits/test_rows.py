@@ -94,8 +94,15 @@ def visit(gmap: Map, views: list[TrainingView], **more: Any) -> Visit:
     """A visit of which nothing but its cameras is known."""
     whole: Any = shape_of(gmap)
     rows, light, none = np.flatnonzero(shown_rows(whole, views)), np.ones(3), np.zeros(0, int)
-    known: dict[str, Any] = dict.fromkeys(("run", "number", "stereo", "near", "masks", "mark", "left_out"))
-    known |= {"rows": rows, "gaussians": gaussians_of(gmap, rows), "light": light, "grey": False, "earlier": []}
+    known: dict[str, Any] = dict.fromkeys(("number", "stereo", "near", "masks", "mark", "left_out"))
+    known |= {
+        "run": IN_MEMORY,
+        "rows": rows,
+        "gaussians": gaussians_of(gmap, rows),
+        "light": light,
+        "grey": False,
+        "earlier": [],
+    }
     return Visit(
         gmap=gmap, whole=whole, photos=Photos([], [], views, []), **{**known, "run": IN_MEMORY, "beside": none, **more}
     )
