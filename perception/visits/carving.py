@@ -29,11 +29,13 @@ UNMEASURED, CHANGED, COVERED = 0.5, 0.5, 0.3
 searched; share of them that is covered by what other photos measured, from which they are not."""
 OTHERS = 16
 """Most other photos by which the rays of a mask are judged."""
-LEAST_SUPPORT, LEAST_ANGLE, AGAINST = 2, 10.0, 0.2
-"""Other photos that must show something new at a point, one of them so many degrees apart; share of those that see so
-far which may show what the map does, as masks have errors."""
-FOUND = 0.3
-"""Share of the rays of a mask with such a point, below which it is an error or a shadow."""
+SUPPORT = (2, 0.3), (1, 0.7)
+"""Other photos that must show something new at a point, and the share of the rays of a mask with such a point, below
+which it is an error or a shadow. The second is for masks of which the first finds nothing, as two photos alone may show
+a small thing: of made rooms things have .97 and more, errors .3 to .9."""
+LEAST_ANGLE, AGAINST = 10.0, 0.2
+"""Degrees by which one of them is apart; share of those that see so far which may show what the map does, as masks have
+errors."""
 BLUR, UNLIKE = 1.5, 0.3
 """Standard deviation in pixels of the window in which colours are compared; their largest difference that counts."""
 PER_AGAINST, PER_SUPPORT, MANY = 0.1, 0.02, 6
@@ -63,7 +65,9 @@ def carved_surface(looks: Sequence[Look], changed: Sequence[np.ndarray], known: 
     spacing = float(np.median(cKDTree(known).query(known, k=2)[0][:, 1])) if len(known) > 1 else 0.0
 
     def found_in(photo: _Photo) -> list[np.ndarray]:
-        return [_on_rays(photo, label, photos) for label in _unmeasured_masks(photo, known, spacing)]
+        masks = _unmeasured_masks(photo, known, spacing)
+        tried = ((_on_rays(photo, label, photos, *support) for support in SUPPORT) for label in masks)
+        return [next(filter(len, points), np.zeros((0, 7))) for points in tried]
 
     parts = [part for each in in_threads(found_in, photos) for part in each if len(part)]
     if not parts:
@@ -97,8 +101,9 @@ def _unmeasured_masks(photo: _Photo, known: np.ndarray, spacing: float) -> list[
     return np.flatnonzero(chosen & (covered < COVERED * areas)).tolist()
 
 
-def _on_rays(photo: _Photo, label: int, photos: Sequence[_Photo]) -> np.ndarray:
-    """[R, 7] point, colour and pixel footprint on rays of a mask; of none, where few of them have such a point."""
+def _on_rays(photo: _Photo, label: int, photos: Sequence[_Photo], least: int, share: float) -> np.ndarray:
+    """[R, 7] point, colour and pixel footprint on rays of a mask; of none, where few of them have such a point. least,
+    share: see SUPPORT."""
     look = photo.look
     row, column = np.nonzero(photo.changed & (look.labels == label))
     thin = slice(None, None, max(1, len(row) // RAYS))
@@ -112,7 +117,7 @@ def _on_rays(photo: _Photo, label: int, photos: Sequence[_Photo]) -> np.ndarray:
         x, y = (np.broadcast_to(at + 0.5, z.shape).ravel() for at in (column, row))
         points = unprojected(K, pose, x, y, z.ravel())
         others = _others(photo, points[len(row) // 2 :: len(row)], photos)
-        judged = _judged(points, np.tile(own, (len(z), 1)), photo, others)
+        judged = _judged(points, np.tile(own, (len(z), 1)), photo, others, least)
         return points.reshape(*z.shape, 3), z, *(values.reshape(z.shape) for values in judged)
 
     nearer = np.repeat(np.linspace(0, 1, STEPS)[:, None], len(row), axis=1)
@@ -121,7 +126,7 @@ def _on_rays(photo: _Photo, label: int, photos: Sequence[_Photo]) -> np.ndarray:
     points, z, cost, difference, _ = swept(nearer[cost.argmin(axis=0), each] + between)
     best = cost.argmin(axis=0), each
     found = np.isfinite(cost[best]) & (difference[best] < flat[0])
-    if found.mean() < FOUND:
+    if found.mean() < share:
         return np.zeros((0, 7))
     return np.column_stack([points[best], own, z[best] / K[0, 0]])[found]
 
@@ -134,13 +139,13 @@ def _others(photo: _Photo, ray: np.ndarray, photos: Sequence[_Photo]) -> list[_P
 
 
 def _judged(
-    points: np.ndarray, colors: np.ndarray, photo: _Photo, others: Sequence[_Photo]
+    points: np.ndarray, colors: np.ndarray, photo: _Photo, others: Sequence[_Photo], least: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of points on rays of a photo, with its colours there [P, 3], each [P]: what counts against them, infinite where
-    they are on no new thing; mean difference of colour to the LEAST_SUPPORT photos likest there;
+    they are on no new thing; mean difference of colour to the `least` photos likest there;
     the same to those in which they lie on the map's surface, infinite where there are none."""
     support, against, apart, near, flat = np.zeros((5, len(points)))
-    best = np.full((LEAST_SUPPORT, len(points)), UNLIKE)  # other photos see other sides of it
+    best = np.full((least, len(points)), UNLIKE)  # other photos see other sides of it
     rays = _unit(points - photo.centre)
     for other in others:
         look, (at, (row, column), depth) = other.look, other.look.view.seen(points)
@@ -160,7 +165,7 @@ def _judged(
         angle = np.arccos(np.clip((rays[at] * _unit(points[at] - other.centre)).sum(axis=1), -1, 1))
         apart[at] = np.maximum(apart[at], np.where(shows, np.degrees(angle), 0))
     seen = np.maximum(support + against, 1)
-    good = (support >= LEAST_SUPPORT) & (apart > LEAST_ANGLE) & (against <= AGAINST * seen)
+    good = (support >= least) & (apart > LEAST_ANGLE) & (against <= AGAINST * seen)
     difference = best.mean(axis=0)
     cost = difference + PER_AGAINST * against / seen - PER_SUPPORT * np.minimum(support, MANY)
     return np.where(good, cost, np.inf), difference, np.where(near > 0, flat / np.maximum(near, 1), np.inf)
