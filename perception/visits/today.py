@@ -3,7 +3,7 @@
 gone       what of the map the photos contradict: instances, and Gaussians of none   `_signs`, `_gone`, `ghosts`
 grown      what stays, and new Gaussians where the photos show another surface       `_grown`
 things     of the new ones those in no instance's masks, grouped                     `_grouped`, `_true`
-pairs      which thing is which gone one, and how it moved; pieces of moved ones     `_moved`, `_apart`, `_pieces`
+pairs      which thing is which gone one, and how it moved (`pairing`); pieces       `_apart`, `_pieces`
 added      ids of the things that are left                                           `_added`
 settled    moved things with their own Gaussians; colours of all that was looked at  `_settled`
 """
@@ -23,17 +23,16 @@ from perception.instances.group import Grouping
 from perception.instances.votes import mask_votes
 from perception.map.history import is_removed
 from perception.map.map import Map
-from perception.visits.colours import in_grey, looks_alike
+from perception.visits.colours import in_grey
 from perception.visits.evidence import Signs, in_free_space, looked_at, seen_rows, signs_of
 from perception.visits.ghosts import ghosts
 from perception.visits.growth import GROWING, SETTLING, grouped, joined_instances, new_surface, trained
 from perception.visits.look import Look
-from perception.visits.motion import ALIKE, CERTAIN, CLOSE, TWINS, Motion, assigned, motion_between
+from perception.visits.motion import Motion
+from perception.visits.pairing import Pairs, Thing, moved
 from perception.visits.registration import REACH, Points, carried
 from perception.visits.visit import Owned, Visit, gaussians_of
 
-UP = (0.0, 0.0, 1.0)
-"""Of a map that does not record gravity."""
 GONE = -0.5
 """Log-odds of standing where it stood, times the score, below which a thing does not. Of 126 things of made scenes that
 went one lies between this and 0, as do floors and walls of which little was measured."""
@@ -60,10 +59,6 @@ more."""
 New = Literal["added", "known", "hidden"]
 """Of what the map has no instance: it came, the map showed it and did not know it as a thing, or no photo looked there
 before."""
-Thing = tuple[np.ndarray, float]
-"""The rows of new Gaussians that are one thing, and its score."""
-Pairs = dict[int, tuple[int, Motion]]
-"""By id of an instance that was gone: the number of the thing that it is, and its motion."""
 
 
 @dataclass
@@ -100,8 +95,9 @@ def seen_today(visit: Visit) -> Today:
     with run.stage("evidence"):
         things, known = _true(visit, before, signs, grown, things, gone)
     with run.stage("motion"):
-        pairs = _moved(visit, grown, things, gone)
-        whole = {j: carried(visit.thing(i), motion.new_from_old) for i, (j, motion) in pairs.items()}
+        pairs = moved(visit, grown, things, gone)
+        stands = [(j, carried(visit.thing(i), motion.new_from_old)) for i, (j, motion) in pairs.items()]
+        whole = {j: Gaussians.concatenate([part for k, part in stands if k == j]) for j, _ in stands}
         things = _apart(things, grown.means.double().numpy(), whole, run.config.instances.min_cluster_size)
         pieces = _pieces(visit, grown, things, whole)
         pairs = {i: pair for i, pair in pairs.items() if pair[0] not in pieces}
@@ -219,39 +215,6 @@ def _numbered(count: int, things: Sequence[Thing]) -> np.ndarray:
     for j, (rows, _) in enumerate(things):
         ids[rows] = j
     return ids
-
-
-def _moved(visit: Visit, grown: Gaussians, things: list[Thing], gone: list[int]) -> Pairs:
-    """Which thing is which instance that is gone, or was already at an earlier visit."""
-    lost = [*gone, *visit.away]
-    if not lost or not things:
-        return {}
-    olds = [visit.thing(i) for i in lost]
-    depths = {entry["id"]: min(entry["obb"]["extent"]) for entry in visit.gmap.instances}
-    gravity = visit.gmap.info.get("gravity")
-    up = np.array(UP) if gravity is None else -np.array(gravity["direction"], np.float64)
-    frames, seen = visit.frames, [visit.seen_from(i) for i in lost]
-    odds, motions = np.full((len(lost), len(things)), -np.inf), dict[tuple[int, int], Motion]()
-    for j, (own, _) in enumerate(things):
-        new = grown.rows(torch.from_numpy(own))
-        rest = grown.rows(torch.from_numpy(np.setdiff1d(np.arange(len(grown)), own)))
-        alike = [looks_alike(old, new) for old in olds]
-        falling = np.argsort(alike, kind="stable")[::-1].tolist()
-        kinds = ([a for a in falling if (lost[a] in visit.away) is away] for away in (False, True))
-        likely = sorted((a for kind in kinds for a in kind[:ALIKE]), key=falling.index)
-        for a in likely:
-            if odds[:, j].max() > CERTAIN and alike[a] < alike[likely[0]] - TWINS:
-                break
-            motion = motion_between(olds[a], new, frames, rest, up, depths[lost[a]], alike[a], seen[a])
-            if motion is not None:
-                odds[a, j], motions[a, j] = motion.odds, motion
-        visit.run.progress.update("motions", j + 1, len(things))
-    pairs = {}
-    for a, j in assigned(odds):
-        rivals = np.concatenate([np.delete(odds[:, j], a), np.delete(odds[a], j)])
-        unsure = rivals.max(initial=-np.inf) > odds[a, j] - CLOSE
-        pairs[lost[a]] = (j, replace(motions[a, j], ambiguous=motions[a, j].ambiguous or bool(unsure)))
-    return pairs
 
 
 def _apart(things: list[Thing], means: np.ndarray, whole: dict[int, Gaussians], least: int) -> list[Thing]:
