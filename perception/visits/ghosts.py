@@ -26,10 +26,11 @@ HITS = 0.5
 """Rays that end at a point, relative to those that end behind it, from which it does not lie in free space."""
 CLUSTERED = 3.0
 """Largest scales of Gaussians, in the median, up to which two are of one cluster."""
-SHOWN, CLEAR = 0.5, 1.0
-"""Factor of opacity from which photos show a cluster, and from which a Gaussian of a ghost stays: of those that lie in
+SHOWN, OWNED, CLEAR = 0.5, 0.1, 1.0
+"""Factor of opacity from which photos show a cluster; the same, if most of it is of instances that stay, as of what is
+misplaced in a fox's fur where nothing changed it is .2 to .7; that from which a Gaussian of a ghost stays: of those in
 free space of a kitchen where nothing changed the median is .84."""
-EVIDENCE = 0.03
+EVIDENCE = 0.1
 """Squared difference of colours in [0, 1], summed over photos, that a Gaussian of a ghost makes in the mean."""
 BEHIND = 0.5
 """Opacity of what stays from which a pixel counts: where the map has nothing behind a ghost, photos do not tell."""
@@ -50,8 +51,10 @@ def ghosts(visit: Visit, looks: Sequence[Look], stays: np.ndarray) -> np.ndarray
         held = stays & ~found
         along, square = compared_without(visit.part(held), free[held], looks)
         cluster = clusters(means[rows], CLUSTERED * float(np.median(scales[rows])))
-        total, change, count = (np.bincount(cluster, weights)[cluster] for weights in (along, square, None))
-        ghost = (total < SHOWN * change) & (change > EVIDENCE * count)
+        sums = along, square, visit.ids[rows] >= 0, np.ones(len(rows))
+        total, change, owned, count = (np.bincount(cluster, weights)[cluster] for weights in sums)
+        shown = np.where(owned > 0.5 * count, OWNED, SHOWN) * change
+        ghost = (total < shown) & (change > EVIDENCE * count)
         found[rows[ghost & (along < CLEAR * square)]] = True
     for i in np.unique(visit.ids[found & (visit.ids >= 0)]).tolist():
         own = visit.ids == i
