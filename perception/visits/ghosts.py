@@ -22,22 +22,18 @@ from perception.visits.evidence import AGREE, LOOKED
 from perception.visits.look import Look, blurred
 from perception.visits.visit import Visit
 
-HITS = 0.5
-"""Rays that end at a point, relative to those that end behind it, from which it does not lie in free space."""
-CLUSTERED = 3.0
-"""Largest scales of Gaussians, in the median, up to which two are of one cluster."""
+HITS, CLUSTERED = 0.5, 3.0
+"""Rays that end at a point, relative to those that end behind it, from which it does not lie in free space; largest
+scales of Gaussians, in the median, up to which two are of one cluster."""
 SHOWN, OWNED, CLEAR = 0.5, 0.1, 1.0
-"""Factor of opacity from which photos show a cluster; the same, if most of it is of instances that stay, as of what is
-misplaced in a fox's fur where nothing changed it is .2 to .7; that from which a Gaussian of a ghost stays: of those in
-free space of a kitchen where nothing changed the median is .84."""
-EVIDENCE = 0.1
-"""Squared difference of colours in [0, 1], summed over photos, that a Gaussian of a ghost makes in the mean."""
-BEHIND = 0.5
-"""Opacity of what stays from which a pixel counts: where the map has nothing behind a ghost, photos do not tell."""
-ROUNDS = 3
-"""What is left of a ghost is told once the rest no longer hides what is behind."""
-MOST = 0.5
-"""Share of an instance that stays of which no more may be ghosts."""
+"""Factor of opacity from which photos show a cluster; the same if most of it is of instances that stay (in a fox's fur
+it is .2 to .7); that from which a Gaussian of a ghost stays (of those in free space of a kitchen the median is .84)."""
+EVIDENCE, BEHIND = 0.1, 0.5
+"""Squared difference of colours in [0, 1], summed over photos, that a Gaussian of a ghost makes in the mean; opacity of
+what stays from which a pixel counts: where the map has nothing behind a ghost, photos do not tell."""
+ROUNDS, MOST = 3, 0.5
+"""What is left of a ghost is told once the rest no longer hides what is behind; share of an instance that stays of
+which no more may be ghosts."""
 
 
 def ghosts(visit: Visit, looks: Sequence[Look], stays: np.ndarray) -> np.ndarray:
@@ -81,10 +77,8 @@ def compared_without(held: Gaussians, free: np.ndarray, looks: Sequence[Look]) -
     along, square = np.zeros((2, len(means)))
     for look in looks:
         view, (height, width) = look.view, look.mapped.shape
-        outs = [
-            render(each, view.camera_from_world, view.K, width, height, harmonics=True, eps2d=view.eps2d)
-            for each in (held, rest)
-        ]
+        camera = view.camera_from_world, view.K, width, height
+        outs = [render(each, *camera, harmonics=True, eps2d=view.eps2d) for each in (held, rest)]
         w, o = (view.exposed(out.colors[0]).clamp(0, 1).numpy() for out in outs)
         depth, p = expected_depth(outs[0]).numpy(), view.photo.numpy().astype(np.float32) / 255
         hidden = (look.measured > 0) & (look.measured < depth * (1 - AGREE))

@@ -86,7 +86,8 @@ def seen_today(visit: Visit) -> Today:
         signs = _signs(visit, before)
         gone, haze = _gone(visit, before, signs)
         leaves = np.isin(gmap.instance_ids, gone)
-        leaves[visit.rows[haze | ghosts(visit, before, ~leaves[visit.rows] & ~haze)]] = True
+        leaves[visit.rows[haze]] = True
+        ghost = visit.rows[ghosts(visit, before, ~leaves[visit.rows])]
         visit = visit.without(leaves)
     stays = ~leaves[visit.rows]
     grown, record = _grown(visit, stays, gone)
@@ -113,7 +114,9 @@ def seen_today(visit: Visit) -> Today:
     # Other new surface through which earlier photos saw stands where nothing did: an error.
     wrong = np.append(_rows([things[j] for j in taken]), fresh[through & ~own])
     kept, rest = visit.rows[stays], np.setdiff1d(np.flatnonzero(~leaves), visit.rows)
-    final, last = _settled(visit, owned, kept, wrong, fresh[own], pairs, gone, not record.iterations)
+    stood = ~np.isin(kept, ghost)  # ghosts go last: what grows beside them tells better what moved
+    shift, kept, owned = np.sum(~stood), kept[stood], owned.rows(np.append(np.flatnonzero(stood), fresh))
+    final, last = _settled(visit, owned, kept, wrong - shift, fresh[own] - shift, pairs, gone, not record.iterations)
     scores: dict[int, tuple[float, New]] = {i: (things[j][1], new) for i, (j, new) in added.items()}
     motions = {i: motion for i, (_, motion) in pairs.items()}
     return Today(rest, final, kept, signs, gone, motions, scores, TrainRecord.joined([record, last], "leg"))
