@@ -28,7 +28,7 @@ scales of Gaussians, in the median, up to which two are of one cluster."""
 SHOWN, OWNED, CLEAR = 0.5, 0.1, 1.0
 """Factor of opacity from which photos show a cluster; the same if most of it is of instances that stay (in a fox's fur
 it is .2 to .7); that from which a Gaussian of a ghost stays (of those in free space of a kitchen the median is .84)."""
-EVIDENCE, BEHIND = 0.1, 0.5
+EVIDENCE, BEHIND = 0.03, 0.5
 """Squared difference of colours in [0, 1], summed over photos, that a Gaussian of a ghost makes in the mean; opacity of
 what stays from which a pixel counts: where the map has nothing behind a ghost, photos do not tell."""
 ROUNDS, MOST = 3, 0.5
