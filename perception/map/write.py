@@ -144,12 +144,13 @@ def tidy_label(label: str) -> str:
 def relink(path: Path, folder: Path) -> dict[str, Any]:
     """Records for every view of the map at `path` the photo below `folder` with the same name and size.
 
-    A photo is searched by the view name ("a/0001.jpg"), that among the photos of its visit, else by the file name
-    alone; capitals and small letters are the same. Where the photo recorded before can still be read, only a copy of it
-    is taken. Else, of files with one name and size, the one with most folders as recorded; one that fits more than one
-    view goes to the view whose folders it has. Views without such a photo keep their record. Returns {"linked": count,
-    "missing": names, "differ": names of photos of another size, which are no photos of other views}. InputError when no
-    photo is found, one may as well be of one view as of another, or while the map is locked by another writer.
+    A photo is searched by the view name ("a/0001.jpg") among the photos of its visit, then by the file name alone;
+    capitals and small letters are the same. If the photo recorded before can still be read, only a copy of it is
+    accepted. Otherwise several files may have the same name and size: the view takes the file whose folders match the
+    recorded path best, and of several views that fit one file the best match gets it. Views without such a photo keep
+    their record. Returns {"linked": count, "missing": names, "differ": names of photos of another size, which are no
+    photos of other views}. InputError when no photo is found, when two views fit a photo equally well, or while the map
+    is locked by another writer.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: is no folder; give the one that holds the photos of {path}")

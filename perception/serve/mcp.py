@@ -317,7 +317,7 @@ def serve_stdio(path: Path, encoders: Any = None, photos: Path | None = None) ->
         try:
             thread.join()
         finally:
-            engine.close(wait=0)  # nobody is there for an answer
+            engine.close(wait=0)  # the client has gone
 
 
 def serve_http(path: Path, settings: ServeSettings, encoders: Any = None, photos: Path | None = None) -> None:

@@ -8,7 +8,7 @@ the driver's work and memory are what the poses and points themselves need.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,7 +87,7 @@ def joined(had: Sequence[Poses], parts: Sequence[Part], start: Poses, seed: int)
     return {i: moved_pose(move, of[i]) for move, of, mine in zip(moves, had, own, strict=True) for i in sorted(mine)}
 
 
-def with_points(model: Any, found: Sequence[Any]) -> Any:
+def with_points(model: Any, found: Iterable[Any]) -> Any:
     """`model` with the points of parts of it: of each those that share no feature with one of a part before."""
     pycolmap, used = load_pycolmap(), set[tuple[int, int]]()
     for part in found:
@@ -117,8 +117,9 @@ def _posed(model: Any, poses: Poses, db: Any | None = None) -> Any:
 
 def _run(
     model: Any, poses: Poses, store: FeatureStore, parts: Sequence[Part], options: ReadOptions, what: str
-) -> list[Any]:
-    """The models that the tasks of one stage, "adjusting" or "points", make of each part of `model` at these poses."""
+) -> Iterator[Any]:
+    """The models that the tasks of one stage, "adjusting" or "points", make of each part of `model` at these poses, one
+    in memory at a time."""
     folder, folders = store.folder / FOLDER, []
     for number, part in enumerate(parts):
         folders.append(folder / what / str(number))
@@ -132,7 +133,7 @@ def _run(
             paths = {"database": str(database.resolve()), "photos": str(store.image_root.resolve())}
             write_task(folders[-1], None, adjust=what == "adjusting", seed=options.seed, **paths)
     results = run_tasks(options.engine, part_task, folders, f"poses: {what}, part", options.progress, each_core=True)
-    return [load_pycolmap().Reconstruction(result) for result in results]
+    return map(load_pycolmap().Reconstruction, results)
 
 
 def part_task(task: str, progress: Progress = QUIET) -> None:

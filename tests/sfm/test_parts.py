@@ -194,7 +194,7 @@ def test_a_walk_adjusted_in_parts_is_the_true_one_and_the_same_on_any_engine(
         assert not (store.folder / parts.FOLDER).exists()
     assert len(given) == 4 and engine.asked == [4, 4]
     assert all(np.array_equal(found[0][image], found[1][image]) for image in found[0])
-    centres = -np.einsum("nji,nj->ni", *(np.array(list(found[0].values()))[:, :, part] for part in (slice(3), 3)))
+    centres = camera_centres(np.array(list(found[0].values())))
     true = camera_centres(truth)
     scale, turn, shift = align_similarity(true, centres)
     away = np.linalg.norm(scale * centres @ turn.T + shift - true, axis=1)

@@ -112,8 +112,7 @@ def test_a_walk_in_submodels_is_the_true_one_and_always_the_same(
     assert found[0] == found[1] == found[2]
     assert len(found[0]) == PHOTOS
     centres = np.array([np.frombuffer(found[0][name]).reshape(3, 4) for name in store.names])
-    centres = -np.einsum("nji,nj->ni", centres[:, :, :3], centres[:, :, 3])
-    truth = camera_centres(truth)
+    centres, truth = camera_centres(centres), camera_centres(truth)
     scale, turn, shift = align_similarity(truth, centres)
     away = np.linalg.norm(scale * centres @ turn.T + shift - truth, axis=1)
     # .3 px are 4 mm at 3 m; errors add up along the 14 m of the walk.
