@@ -38,6 +38,7 @@ LAYERS = """
     edit report
     serve
     node viewer pipeline bench models
+    changes
     visits
     cli
 """

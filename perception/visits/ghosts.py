@@ -16,10 +16,10 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from perception.changes.evidence import AGREE, LOOKED
+from perception.changes.look import Look, blurred
 from perception.gaussians.model import Gaussians
 from perception.gaussians.views import expected_depth, render
-from perception.visits.evidence import AGREE, LOOKED
-from perception.visits.look import Look, blurred
 from perception.visits.visit import Visit
 
 HITS, CLUSTERED = 0.5, 3.0

@@ -9,6 +9,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from perception.changes.carving import carved_surface
+from perception.changes.evidence import AGREE, mask_odds
+from perception.changes.look import DIFFERENT, Look
 from perception.config import MapConfig
 from perception.gaussians.depth_start import start_on_surface
 from perception.gaussians.model import Gaussians, from_points
@@ -19,9 +22,6 @@ from perception.instances.assign import LEAST_AGREEMENT, affinities, mask_shares
 from perception.instances.group import Grouping, group
 from perception.masks.votes import MaskVotes
 from perception.pipeline.checkpoint import TrainingObserver
-from perception.visits.carving import carved_surface
-from perception.visits.evidence import AGREE, mask_odds
-from perception.visits.look import DIFFERENT, Look
 from perception.visits.visit import Visit
 
 GROWING, SETTLING = 0.16, 0.1

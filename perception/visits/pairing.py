@@ -12,10 +12,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from perception.changes.colours import looks_alike
+from perception.changes.motion import ALIKE, CERTAIN, CLOSE, TWINS, Motion, assigned, motion_between
+from perception.changes.registration import Points, touching
 from perception.gaussians.model import Gaussians
-from perception.visits.colours import looks_alike
-from perception.visits.motion import ALIKE, CERTAIN, CLOSE, TWINS, Motion, assigned, motion_between
-from perception.visits.registration import Points, touching
 from perception.visits.visit import Visit
 
 UP = (0.0, 0.0, 1.0)

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import torch
 
+from perception.changes.look import compared
 from perception.gaussians.model import as_gaussians
 from perception.gaussians.views import TrainingView, rgb_image
 from perception.geometry import camera_centres
@@ -22,7 +23,6 @@ from perception.photos.video import motion_between
 from perception.photos.views import view_lens
 from perception.pipeline.optimise import Photos, Run
 from perception.types import View
-from perception.visits.look import compared
 
 OFF = 0.0025
 """Median motion of corners between photo and render, as a share of the width, above which poses are wrong: of true

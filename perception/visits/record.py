@@ -12,14 +12,14 @@ import numpy as np
 import torch
 
 from perception.boxes import instance_entry
+from perception.changes.evidence import UNSEEN, Signs, probability
+from perception.changes.motion import Motion
 from perception.colors import rgb_from_sh, sh_from_rgb
 from perception.gaussians.model import Gaussians
 from perception.language.description import chosen_rows, from_arrays, to_arrays
 from perception.map.history import is_removed, visits_of
 from perception.map.map import Map, language_in, prefixed
 from perception.photos.decode import CAMERA_FOLDER, exif_of, open_photo
-from perception.visits.evidence import UNSEEN, Signs, probability
-from perception.visits.motion import Motion
 
 _GEOMETRY = ("num_gaussians", "centroid", "obb", "aabb")
 NOWHERE = 0.7

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from perception.changes.evidence import AGREE, sight
 from perception.colors import sh_from_rgb
 from perception.gaussians.model import Gaussians, HeldGaussians
 from perception.gaussians.views import TrainingView, render
@@ -16,7 +17,6 @@ from perception.geometry import camera_centres
 from perception.io.memory import Keep
 from perception.photos.decode import scaled_K, scaled_size
 from perception.types import View
-from perception.visits.evidence import AGREE, sight
 
 SHOWN, HIDDEN = 0.9, 0.05
 """Opacity from which the map shows a pixel, and share of something else in it from which it does not count."""

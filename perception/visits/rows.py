@@ -12,13 +12,13 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from perception.changes.evidence import at_surface
+from perception.changes.look import in_view
 from perception.gaussians.model import Gaussians, HeldGaussians
 from perception.gaussians.views import TrainingView, expected_depth
 from perception.map.map import Map
 from perception.rasterizer.rasterize import rasterizer_for
 from perception.rasterizer.types import Cotangents, Gradients, Settings
-from perception.visits.evidence import at_surface
-from perception.visits.look import in_view
 
 FAINTEST = 0.02
 """Pixels that a Gaussian fills of a picture, its weights summed, from which that shows it. Without the others pixels of

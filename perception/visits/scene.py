@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from perception.changes.look import Look, correlation
 from perception.config import MapConfig, fields, flat, load_config, read_pairs, read_toml
 from perception.errors import InputError
 from perception.frame.recentre import map_from_input, moved
@@ -29,7 +30,6 @@ from perception.pipeline.checkpoint import frames_folder
 from perception.pipeline.optimise import Run
 from perception.sfm.options import ReadOptions
 from perception.types import Scene, View
-from perception.visits.look import Look, correlation
 from perception.visits.record import time_taken
 
 POINTS = 1000

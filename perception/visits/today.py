@@ -17,20 +17,20 @@ from typing import Literal
 import numpy as np
 import torch
 
+from perception.changes.colours import in_grey
+from perception.changes.evidence import Signs, in_free_space, looked_at, seen_rows, signs_of
+from perception.changes.look import Look
+from perception.changes.motion import Motion
+from perception.changes.registration import REACH, Points, carried
 from perception.gaussians.model import Gaussians, Nearby
 from perception.gaussians.state import TrainRecord
 from perception.instances.group import Grouping
 from perception.instances.votes import mask_votes
 from perception.map.history import is_removed
 from perception.map.map import Map
-from perception.visits.colours import in_grey
-from perception.visits.evidence import Signs, in_free_space, looked_at, seen_rows, signs_of
 from perception.visits.ghosts import ghosts
 from perception.visits.growth import GROWING, SETTLING, grouped, joined_instances, new_surface, trained
-from perception.visits.look import Look
-from perception.visits.motion import Motion
 from perception.visits.pairing import Pairs, Thing, moved
-from perception.visits.registration import REACH, Points, carried
 from perception.visits.visit import Owned, Visit, gaussians_of
 
 GONE = -0.5

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from perception.changes.colours import in_grey
 from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.model import Nearby
@@ -41,7 +42,6 @@ from perception.pipeline.optimise import Optimised, Run
 from perception.pipeline.record import finite, score_views
 from perception.progress import QUIET, Progress
 from perception.types import View
-from perception.visits.colours import in_grey
 from perception.visits.record import (
     joined_language,
     kept_parts,

@@ -12,6 +12,18 @@ from typing import Any
 import numpy as np
 import torch
 
+from perception.changes.colours import grey_photo, in_grey, in_light, without_colours
+from perception.changes.evidence import seen_rows
+from perception.changes.look import (
+    Look,
+    compared,
+    depth_at,
+    look,
+    seen_from,
+    stereo_of,
+    with_exposure,
+)
+from perception.changes.registration import compact
 from perception.gaussians.model import STORED, Gaussians
 from perception.gaussians.photos import split_scene
 from perception.gaussians.views import TrainingView
@@ -22,20 +34,8 @@ from perception.masks.stereo import StereoView
 from perception.pipeline.checkpoint import digest, training_mark
 from perception.pipeline.optimise import Photos, Run, label_photos
 from perception.types import View
-from perception.visits.colours import grey_photo, in_grey, in_light, without_colours
-from perception.visits.evidence import seen_rows
-from perception.visits.look import (
-    Look,
-    compared,
-    depth_at,
-    look,
-    seen_from,
-    stereo_of,
-    with_exposure,
-)
 from perception.visits.placing import checked_poses
 from perception.visits.record import as_it_was
-from perception.visits.registration import compact
 from perception.visits.rehearsal import rehearsed, showing, to_rehearse
 from perception.visits.rows import shape_of, shown_rows
 from perception.visits.scene import foreign_photos, refuse_older, visit_scene

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from perception.changes.carving import carved_surface
+from perception.changes.evidence import mask_odds
+from perception.changes.look import Look
 from perception.gaussians.views import TrainingView
-from perception.visits.carving import carved_surface
-from perception.visits.evidence import mask_odds
-from perception.visits.look import Look
 from support.aimed import look_at
 
 CENTRE, RADIUS, SIZE, FOCAL = np.array([0.1, -0.05, 0.25]), 0.25, (90, 120), 130.0

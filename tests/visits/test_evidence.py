@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
+from perception.changes.evidence import in_free_space, looked_at, signs_of
+from perception.changes.look import Look, in_view
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.views import TrainingView, render
 from perception.io.memory import DiskArrays
 from perception.types import View
-from perception.visits.evidence import in_free_space, looked_at, signs_of
-from perception.visits.look import Look, in_view
 from perception.visits.record import recorded, with_parts
 from perception.visits.rehearsal import rehearsed, showing, to_rehearse
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
+from perception.changes.look import Look, look
 from perception.gaussians.model import Gaussians, isotropic
 from perception.gaussians.views import TrainingView, expected_depth, render
 from perception.visits.ghosts import clusters, compared_without, ghosts, seen_through
-from perception.visits.look import Look, look
 from perception.visits.visit import Visit
 from support.aimed import look_at
 

@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from PIL import Image
 
+from perception.changes.colours import grey_photo, in_grey
+from perception.changes.look import Look, depth_at, moments, stereo_of
 from perception.gaussians.model import Gaussians, isotropic
 from perception.gaussians.views import TrainingView, render
 from perception.pipeline.optimise import Photos
 from perception.types import DepthImage, View
-from perception.visits.colours import grey_photo, in_grey
-from perception.visits.look import Look, depth_at, moments, stereo_of
 from perception.visits.visit import _of_this_place
 
 H, W = 120, 160

@@ -12,13 +12,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from perception.gaussians.model import Gaussians, isotropic
-from perception.gaussians.views import TrainingView, render
-from perception.instances.group import Grouping
-from perception.types import View
-from perception.visits.colours import GREY, HUES, LOOKS, colour_odds
-from perception.visits.look import seen_from
-from perception.visits.motion import (
+from perception.changes.colours import GREY, HUES, LOOKS, colour_odds
+from perception.changes.look import seen_from
+from perception.changes.motion import (
     Cut,
     _upright_starts,
     assigned,
@@ -26,7 +22,11 @@ from perception.visits.motion import (
     other_sides,
     refined,
 )
-from perception.visits.registration import Points, angle_between, carried, compact, looks_round, register
+from perception.changes.registration import Points, angle_between, carried, compact, looks_round, register
+from perception.gaussians.model import Gaussians, isotropic
+from perception.gaussians.views import TrainingView, render
+from perception.instances.group import Grouping
+from perception.types import View
 from perception.visits.today import _apart, _without_fragments
 from support.aimed import look_at
 

@@ -8,12 +8,12 @@ from typing import Any, cast
 import numpy as np
 import torch
 
+from perception.changes.motion import Motion
+from perception.changes.registration import Points, angle_between, carried, touching
 from perception.gaussians.model import Gaussians, isotropic
 from perception.gaussians.views import TrainingView, render
 from perception.progress import QUIET
-from perception.visits.motion import Motion
 from perception.visits.pairing import _paired, moved, whole
-from perception.visits.registration import Points, angle_between, carried, touching
 from perception.visits.visit import Visit
 from support.aimed import look_at
 

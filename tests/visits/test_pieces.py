@@ -10,13 +10,13 @@ import pytest
 import torch
 from scipy.sparse import csr_matrix
 
+from perception.changes.evidence import signs_from
+from perception.changes.look import Look, look
 from perception.config import load_config
 from perception.gaussians.model import Gaussians, isotropic
 from perception.gaussians.views import TrainingView, render
 from perception.masks.votes import MaskVotes
-from perception.visits.evidence import signs_from
 from perception.visits.growth import grouped
-from perception.visits.look import Look, look
 from perception.visits.today import _apart, _gone, _pieces
 from perception.visits.visit import Visit
 from support.aimed import look_at

@@ -12,6 +12,8 @@ import pytest
 import torch
 from PIL import Image
 
+from perception.changes.colours import without_colours
+from perception.changes.look import Look
 from perception.config import MapConfig, load_config
 from perception.errors import InputError
 from perception.gaussians.model import Gaussians, from_points, isotropic
@@ -23,9 +25,7 @@ from perception.pipeline.changes import inputs_of
 from perception.pipeline.checkpoint import digest, fingerprint
 from perception.pipeline.optimise import Photos, Run
 from perception.types import View
-from perception.visits.colours import without_colours
 from perception.visits.growth import GROWING, LEAST_ITERATIONS, SETTLING, changed_pixels, trained, update_config
-from perception.visits.look import Look
 from perception.visits.record import joined_language, visit_record
 from perception.visits.scene import foreign_photos, refuse_older, update_settings
 from perception.visits.update import _encoder_of, renamed, update_map

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from perception.changes.evidence import signs_from
+from perception.changes.motion import Motion
 from perception.colors import rgb_from_sh
 from perception.edit.scale import scaled
 from perception.errors import InputError
 from perception.map.history import changes_of, stood, visits_of
 from perception.map.map import Map
 from perception.map.write import read_map, write_map
-from perception.visits.evidence import signs_from
-from perception.visits.motion import Motion
 from perception.visits.record import as_it_was, past_with, recorded
 from support.visited_map import ball, number, write_visited_map
 

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from perception.changes.look import Look, correlation
 from perception.gaussians.model import Gaussians
 from perception.gaussians.views import TrainingView, depth_image
 from perception.photos.decode import scaled_K, scaled_size
 from perception.types import View
-from perception.visits.look import Look, correlation
 
 AGREE = 0.03
 """Relative difference of depths up to which two are of one surface: the noise of stereo."""

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from perception.changes.evidence import AGREE, LEAST_PIXELS, mask_odds
+from perception.changes.look import Look
 from perception.gaussians.depth_start import DepthCloud
 from perception.gaussians.views import unprojected
 from perception.geometry import inverse_se3, sums_by
 from perception.machine import in_threads
 from perception.masks.surface import voxel_keys
-from perception.visits.evidence import AGREE, LEAST_PIXELS, mask_odds
-from perception.visits.look import Look
 
 RAYS, STEPS, FINER, NEAREST = 300, 64, 9, 0.3
 """Rays of a mask; points on each, evenly in inverse depth, from the map's surface to NEAREST of its depth; finer ones

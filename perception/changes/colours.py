@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from perception.changes.registration import Points
 from perception.colors import rgb_from_sh, sh_from_rgb
 from perception.gaussians.model import Gaussians
 from perception.gaussians.views import TrainingView
-from perception.visits.registration import Points
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 """Shares of red, green and blue in brightness (ITU-R BT.601), as in grey photos of Pillow and OpenCV."""

@@ -17,15 +17,15 @@ from functools import cached_property
 import numpy as np
 import torch
 
+from perception.changes.colours import LOOKS, LUMA, colour_odds
+from perception.changes.evidence import WEIGHTS, Signs, signs_from, sums_in
+from perception.changes.look import Look, blurred, projected
+from perception.changes.registration import BEST, TURNED, YAWS, Points, angle_between, looks_round, register, turns
 from perception.gaussians.model import Gaussians
 from perception.gaussians.views import TrainingView, expected_depth, render
 from perception.geometry import inverse_se3, transform
 from perception.rasterizer.rasterize import rasterizer_for
 from perception.rasterizer.types import Settings
-from perception.visits.colours import LOOKS, LUMA, colour_odds
-from perception.visits.evidence import WEIGHTS, Signs, signs_from, sums_in
-from perception.visits.look import Look, blurred, projected
-from perception.visits.registration import BEST, TURNED, YAWS, Points, angle_between, looks_round, register, turns
 
 VISIBLE, TOUCHING = 0.3, 0.02
 """Least opacity of a pixel that shows a thing; relative depth by which it may lie behind what it stands on."""
