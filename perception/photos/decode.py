@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import math
+import os
+import struct
 import threading
 import warnings
 from collections.abc import MutableMapping
@@ -13,7 +15,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from PIL import Image, ImageOps, TiffImagePlugin, UnidentifiedImageError
+from PIL import Image, ImageFile, ImageOps, TiffImagePlugin, UnidentifiedImageError
 
 from perception.errors import InputError, missing_extra
 from perception.io.documents import refusing
@@ -49,11 +51,6 @@ def photo_size(path: Path, as_stored: bool = False) -> tuple[int, int]:
         return size[::-1] if turned and not as_stored else size
 
 
-def is_turned(path: Path) -> bool:
-    """Whether EXIF says that the photo is to be rotated or mirrored."""
-    return orientation(path) != 1
-
-
 def orientation(path: Path) -> int:
     """EXIF's orientation of the photo, 1 to 8; 1 where it is missing or another number."""
     with open_photo(path) as image:
@@ -82,7 +79,21 @@ ORIENTATION, CAMERA_FOLDER, GPS_FOLDER = 0x0112, 0x8769, 0x8825
 def exif_of(image: Image.Image, path: Path, folder: int | None = None) -> MutableMapping[int, Any]:
     """The EXIF data of an open photo, or of a folder in them; empty if there are none. InputError if damaged."""
     with refusing(f"{path}: {_BAD_EXIF}"):
-        return image.getexif() if folder is None else image.getexif().get_ifd(folder)
+        tags = Image.Image.getexif(_without_pixels(path)) if image.format == "PNG" else image.getexif()
+        return tags if folder is None else tags.get_ifd(folder)
+
+
+def _without_pixels(path: Path) -> Image.Image:
+    """A PNG of the same chunks but those of pixels: EXIF data may lie behind them, for which Pillow decodes them."""
+    with path.open("rb") as file:
+        kept = [file.read(8)]
+        while len(head := file.read(8)) == 8:
+            length, kind = struct.unpack(">I4s", head)
+            if kind in (b"IDAT", b"fdAT"):
+                file.seek(length + 4, os.SEEK_CUR)
+            elif len(body := file.read(length + 4)) == length + 4:
+                kept += [head, body]
+    return _open(io.BytesIO(b"".join(kept) + bytes(4) + _PNG_END))
 
 
 def upright(image: Image.Image, path: Path) -> Image.Image:
@@ -107,21 +118,26 @@ def why_left_out(path: Path, strict: bool = False) -> str | None:
 
 def read_photo(path: Path, as_stored: bool = False) -> np.ndarray:
     """The photo as uint8 [h, w, 3] RGB, rotated as in EXIF unless `as_stored`; (w, h) = photo_size(path, as_stored).
-    Grey is repeated to three channels, 16 bits become 8 (v / 257 rounded), palettes are expanded; transparent pixels
-    are composited on black. Floating-point images are refused. HEIC needs pillow-heif (extra "heic")."""
+    Grey is repeated to three channels, of 16 bits it becomes 8 (v / 257 rounded), palettes are expanded; transparent
+    pixels are composited on black. Floating-point images are refused. HEIC needs pillow-heif (extra "heic")."""
     with open_photo(path) as image:
         factor, (width, height) = _reduction(image), image.size
         if factor > 1:
             image.draft(None, (width // factor, height // factor))  # only JPEG is decoded at a reduced size
             factor = max(1, round(factor * image.width / width))
-        back = _BACK.get(getattr(image, "tag_v2", {}).get(ORIENTATION, 1))  # Pillow turns a TIFF when it decodes it
-        decode(image, path)
-        if not as_stored:
-            image = upright(image, path)
-        elif back is not None:
-            image = image.transpose(back)
-        photo = to_rgb(image, path)
+        photo = pixels_of(image, path, as_stored)
     return photo if factor == 1 else np.array(Image.fromarray(photo).reduce(factor))
+
+
+def pixels_of(image: Image.Image, path: Path, as_stored: bool = False) -> np.ndarray:
+    """An open photo decoded as uint8 [h, w, 3] RGB, rotated as in EXIF unless `as_stored`; see read_photo."""
+    back = _BACK.get(getattr(image, "tag_v2", {}).get(ORIENTATION, 1))  # Pillow turns a TIFF when it decodes it
+    decode(image, path)
+    if not as_stored:
+        image = upright(image, path)
+    elif back is not None:
+        image = image.transpose(back)
+    return to_rgb(image, path)
 
 
 _BACK = {
@@ -242,6 +258,7 @@ def open_photo(path: Path) -> Image.Image:
         if header[8:12] in _HEIF_BRANDS or (path.suffix.lower() in HEIF_SUFFIXES and not header.startswith(_OTHERS)):
             _register_heif()
         image = _open(path)
+        image.filename = ""  # which Pillow would map into memory: turned TIFFs with the sides of the upright photo
         most = math.inf if image.format in _REDUCED else None  # that of these is checked when it is known
         check_size(path, image.size, image.format, path.stat().st_size, most)
         return image
@@ -255,7 +272,7 @@ def _register_heif() -> None:
     pillow_heif.register_heif_opener(thumbnails=False)
 
 
-def _open(source: Path | io.BytesIO) -> Image.Image:
+def _open(source: Path | io.BytesIO) -> ImageFile.ImageFile:
     with _OPENING:  # Pillow's limit is global and lies below LARGE_PIXELS; MOST_DECODED is checked instead
         limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
         try:

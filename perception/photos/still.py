@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from perception.io.atomic import write_file
-from perception.photos.decode import decode, nearest, open_photo, reduced_size, to_rgb, upright
+from perception.photos.decode import nearest, open_photo, pixels_of, reduced_size
 from perception.photos.ignore_masks import read_mask
 from perception.progress import Progress
 
@@ -111,8 +111,7 @@ def _small(photo: Path, size: tuple[int, int], as_stored: bool) -> np.ndarray:
     width, height = (max(1, round(scale * side)) for side in size)
     with open_photo(photo) as image:
         image.draft("RGB", reduced_size(*image.size, max(1, int(min(image.size) / (2 * SIDE)))))
-        decode(image, photo)
-        picture = to_rgb(image if as_stored else upright(image, photo), photo)
+        picture = pixels_of(image, photo, as_stored)
     return cv2.resize(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (width, height), interpolation=cv2.INTER_AREA)
 
 

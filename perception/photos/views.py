@@ -9,7 +9,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.geometry import camera_centres, far_from_most, nearest_rotation, transform
-from perception.photos.decode import is_turned, photo_size
+from perception.photos.decode import orientation, photo_size
 from perception.photos.lens import is_pinhole, pinhole_from_lens, rescale_lens, resized
 from perception.types import Lens, View
 
@@ -53,7 +53,8 @@ def posed_view(
     """
     for as_stored in (False,) if upright else (True, False):
         if (fitted := fit_lens(lens, photo, as_stored)) is not None:
-            view = replace(make_view(name, photo, fitted, pose, source), as_stored=as_stored and is_turned(photo))
+            turned = as_stored and orientation(photo) != 1
+            view = replace(make_view(name, photo, fitted, pose, source), as_stored=turned)
             size, full = f"{fitted.width}×{fitted.height}", f"{lens.width}×{lens.height}"
             return view, None if size == full else f"{photo.name}: photo {size}, camera {full}: intrinsics scaled"
     found = f"{photo.name} is {'×'.join(map(str, photo_size(photo)))} but its camera says {lens.width}×{lens.height}"

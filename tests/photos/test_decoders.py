@@ -122,6 +122,35 @@ def test_the_size_of_a_picture_too_large_to_be_read_is_refused(tmp_path: Path, m
     refused(photo_size, tmp_path / "a.png", match="at most 100")
 
 
+def test_the_exif_of_a_png_is_found_behind_its_pixels_without_them(tmp_path: Path) -> None:
+    """Pillow decodes all pixels in search of it, which took as long as reading the photo."""
+    exif, held, file = Image.Exif(), io.BytesIO(), tmp_path / "a.png"
+    exif[0x0112] = 6
+    picture = Image.fromarray(np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8))
+    picture.save(held, "PNG", exif=exif)
+    content = held.getvalue()
+    at, pixels = content.index(b"eXIf") - 4, content.index(b"IDAT") - 4
+    chunk, end = content[at:pixels], content.index(b"IEND") - 4
+    file.write_bytes(content[:at] + content[pixels:end] + chunk + content[end:])
+    assert photo_size(file) == read_photo(file).shape[1::-1] == (60, 80)
+    assert photo_size(file, as_stored=True) == read_photo(file, as_stored=True).shape[1::-1] == (80, 60)
+    file.write_bytes(content[: pixels + 1000])
+    assert photo_size(file) == (60, 80)
+    refused(read_photo, file, match="damaged or cut short")
+
+
+@pytest.mark.parametrize("turn", [3, 6, 8])
+@pytest.mark.parametrize("kind", ["L", "RGB", "RGBA", "I;16"])
+def test_a_turned_tiff_is_read_upright_and_as_stored(tmp_path: Path, kind: str, turn: int) -> None:
+    """Pillow maps grey and 16 bits into memory, with the sides of the upright photo."""
+    grey, file = np.random.default_rng(0).integers(0, 255, (6, 8), np.uint8), tmp_path / "a.tif"
+    picture = Image.fromarray(grey.astype(np.uint16) * 257) if kind == "I;16" else Image.fromarray(grey).convert(kind)
+    picture.save(file, tiffinfo={0x0112: turn})
+    for as_stored, expected in ((True, grey), (False, np.rot90(grey, {3: 2, 6: -1, 8: 1}[turn]))):
+        np.testing.assert_array_equal(read_photo(file, as_stored), np.repeat(expected[..., None], 3, axis=2))
+        assert photo_size(file, as_stored) == expected.shape[::-1]
+
+
 def test_a_png_without_its_end_is_refused_in_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     Image.new("L", (20, 6)).save(tmp_path / "a.png")
     (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:-3])

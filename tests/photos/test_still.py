@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from perception.photos import still
 from perception.photos.ignore_masks import read_mask
@@ -148,3 +149,21 @@ def test_masks_are_by_camera_and_keep_those_of_the_user(tmp_path: Path, wall: np
     times = {file: file.stat().st_mtime_ns for file in (tmp_path / "masks").iterdir()}
     assert with_still(photos, sizes, given, tmp_path / "masks", QUIET).masks == found.masks
     assert times == {file: file.stat().st_mtime_ns for file in (tmp_path / "masks").iterdir()}
+
+
+def test_masks_of_photos_that_are_used_as_stored_are_not_turned(wall: np.ndarray, tmp_path: Path) -> None:
+    """Pillow turns a TIFF when it decodes it."""
+    pictures, _ = pads(walk(wall, 12))
+    for number, picture in enumerate(pictures):
+        for end, options in ((".png", {}), (".tif", {"tiffinfo": {0x0112: 6}})):
+            file = tmp_path / end[1:] / f"{number}{end}"
+            file.parent.mkdir(exist_ok=True)
+            Image.fromarray(picture).save(file, **options)
+    found = []
+    for kind in ("png", "tif"):
+        photos = sorted((tmp_path / kind).iterdir())
+        size, none = SIZE[::-1], [None] * len(photos)
+        masks = with_still(photos, [size] * len(photos), none, tmp_path / "masks", QUIET, [True] * len(photos)).masks
+        assert masks[0] is not None
+        found.append(read_mask(masks[0], *size))
+    np.testing.assert_array_equal(*found)
