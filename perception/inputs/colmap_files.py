@@ -117,7 +117,7 @@ def _checked_text(model: Model) -> dict[int, int]:
     cameras, images, frames, used = list[str](), list[str](), list[str](), dict[int, int]()
     for start, line in _lines(model, "cameras"):
         number, kind, *rest = line.split() if " " in line else (line, "")
-        if not model.judge("cameras", int(_numbers([number], start)[0]), _numbers(rest, start)):
+        if not model.judge("cameras", _id(number, start), _numbers(rest, start)):
             rest[2:] = ["1"] * len(rest[2:])
         found = f"camera {number} of model {brief(kind)} with {len(rest[2:])} parameters is not known to COLMAP"
         with refusing(f"{start}: {found}; expected as in its documentation, Camera Models"):
@@ -126,16 +126,16 @@ def _checked_text(model: Model) -> dict[int, int]:
         cameras.append(" ".join([number, kind, *rest]))
     known = [line.partition(" ")[0] for line in cameras]
     for start, fields, points in _text_images(model):
-        image_id = int(fields[0])
+        image_id = _id(fields[0], start)
         if not model.judge("images", image_id, _numbers(fields[1:8], start)):
             fields[1:8] = map(str, _STILL)
         if fields[8] not in known:
             raise InputError(f"{start}: image {image_id} has camera {fields[8]}, which cameras.txt lacks")
-        used[image_id] = int(fields[8])
+        used[image_id] = _id(fields[8], start)
         images += [" ".join([*fields[:9], fields[0]]), points]
     for start, line in _lines(model, "frames"):
         fields = line.split()
-        if not model.judge("frames", int(_numbers(fields[:1], start)[0]), _numbers(fields[2:9], start)):
+        if not model.judge("frames", _id(fields[0], start), _numbers(fields[2:9], start)):
             fields[2:9] = map(str, _STILL)
         frames.append(" ".join(fields))
     raw = {kind: model.file(kind).read_bytes() for kind in _HEADS if model.file(kind).is_file()}
@@ -169,7 +169,7 @@ def _text_images(model: Model) -> Iterator[tuple[str, list[str], str]]:
         fields = line.split(None, 9)
         if len(fields) < 10:
             raise InputError(f"{start}: expected an image: id, quaternion, position, camera, name; found {brief(line)}")
-        model.names[int(_numbers([fields[0], fields[8]], start)[0])] = fields[9]
+        model.names[_id(fields[0], start)] = fields[9]
         points = next(lines, ("", ""))[1]
         if len(points.split()) % 3:
             what = f"the line after this image holds {brief(points)}; expected its points 'x y id …', or an empty line"
@@ -188,6 +188,12 @@ def _lines(model: Model, kind: str) -> Iterator[tuple[str, str]]:
             continue
         head = kind != "images" or not head
         yield f"{file}: line {number}", line
+
+
+def _id(text: str, start: str) -> int:
+    if not (text.isascii() and text.isdigit()):
+        raise InputError(f"{start}: the id {brief(text)} is no whole number")
+    return int(text)
 
 
 def _numbers(fields: Sequence[str], start: str) -> list[float]:

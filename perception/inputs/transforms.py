@@ -149,7 +149,8 @@ def lens_values(lens: Lens) -> dict[str, Any]:
     values: dict[str, Any] = {"camera_model": model}
     for name, value in zip(camera_from_lens(lens).params_info.split(", "), lens.params, strict=True):
         values.update(dict.fromkeys(names.get(name, (name,)), value))
-    if values.keys() - {"camera_model", "fl_x", "fl_y", "cx", "cy", *(FISHEYE if fisheye else PERSPECTIVE)}:
+    known = {"camera_model", "fl_x", "fl_y", "cx", "cy", *(FISHEYE if fisheye else PERSPECTIVE)}
+    if "DIVISION" in lens.model or values.keys() - known:  # whose k is of another formula
         raise InputError(f"camera model {lens.model} cannot be written to a transforms.json; undistort the photos")
     return {**values, "w": lens.width, "h": lens.height}
 

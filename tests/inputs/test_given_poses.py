@@ -4,6 +4,7 @@ What is wrong with one photo leaves that one out."""
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -229,6 +230,15 @@ def test_decimal_commas_are_told(file: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=rf"{file}\.txt.*decimal comma") as caught:
         loaded(folder)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("number", ["1.0", "nan", "1e400"])
+@pytest.mark.parametrize("file", ["cameras", "images"])
+def test_ids_that_are_no_whole_numbers_are_told(file: str, number: str, tmp_path: Path) -> None:
+    target = workspace(tmp_path / "in") / "sparse/0" / f"{file}.txt"
+    target.write_text(re.sub("^1 ", f"{number} ", target.read_text(), flags=re.MULTILINE))
+    with pytest.raises(InputError, match=rf"{file}\.txt: line \d+: the id '{number}' is no whole number"):
+        loaded(tmp_path / "in")
 
 
 @pytest.mark.parametrize("value", ["nan", "-nan(ind)", "1.#QNAN", "inf"])

@@ -247,6 +247,7 @@ def test_poses_in_another_map_are_refused_unless_that_is_the_input(folder: Path,
         ("OPENCV", (300.0, 310.0, 200.0, 150.0, 0.05, -0.02, 0.001, 0.002)),
         ("FULL_OPENCV", (300.0, 310.0, 200.0, 150.0, 0.05, -0.02, 0.001, 0.002, 0.01, 0.02, 0.0, 0.0)),
         ("SIMPLE_RADIAL_FISHEYE", (300.0, 200.0, 150.0, 0.05)),
+        ("FISHEYE", (300.0, 310.0, 200.0, 150.0)),
     ],
 )
 def test_every_lens_is_written_so_that_it_sees_the_same(model: str, params: tuple[float, ...], tmp_path: Path) -> None:
@@ -258,9 +259,11 @@ def test_every_lens_is_written_so_that_it_sees_the_same(model: str, params: tupl
     assert np.allclose(camera_from_lens(back).img_from_cam(rays), camera_from_lens(lens).img_from_cam(rays))
 
 
-def test_a_lens_without_keys_is_refused() -> None:
-    with pytest.raises(perception.InputError, match="FOV cannot be written"):
-        lens_values(Lens("FOV", (300.0, 300.0, 200.0, 150.0, 0.5), 400, 300))
+@pytest.mark.parametrize("model", ["FOV", "DIVISION"])
+def test_a_lens_without_keys_is_refused(model: str) -> None:
+    """Also where its parameter is called k, as that of another formula."""
+    with pytest.raises(perception.InputError, match=f"{model} cannot be written"):
+        lens_values(Lens(model, (300.0, 300.0, 200.0, 150.0, 0.5), 400, 300))
 
 
 def test_posed_photos_bring_no_masks_of_what_stays_in_the_picture(folder: Path, tmp_path: Path) -> None:
