@@ -51,6 +51,8 @@ def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[st
     if wrong := [kind for kind in what if kind not in KINDS]:
         raise InputError(f"--what: found '{wrong[0]}', expected one of: {', '.join(KINDS)}")
     gmap = read_map(map_path)
+    if "instances" in what and gmap.instance_ids.max(initial=-1) >= 65535:
+        raise InputError(f"{map_path}: has instances above 65534, beyond pictures of 16 bits; give --what without them")
     views = map_views(gmap) if cameras is None else _cameras(cameras)
     if cameras is not None and not in_map_frame(cameras, gmap.info, gmap.views):
         views = [moved(view, map_from_input(map_path, gmap.info)) for view in views]

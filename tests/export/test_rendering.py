@@ -15,6 +15,7 @@ from perception.export.render import render_map
 from perception.map.write import write_map
 from perception.masks.label_files import label_file
 from perception.types import View
+from support.synthetic_map import write_synthetic_map
 from support.viewer_maps import small_map
 
 OUTSIDE = ["../outside", "a/../../outside", "..\\outside"]
@@ -56,6 +57,13 @@ def test_a_name_in_a_camera_file_never_leaves_the_output_folder(names: list[str]
     path = received_map(tmp_path, "a.jpg")
     with pytest.raises(InputError, match=r"cameras\.json: "):
         render_map(path, tmp_path / "out", camera_file(tmp_path, names), ["rgb", "depth"])
+    assert files(tmp_path) == set()
+
+
+def test_ids_that_a_picture_cannot_hold_are_told(tmp_path: Path) -> None:
+    write_synthetic_map(tmp_path / "m.gsmap", ["mug", "lamp"], None, gaussians=300, first_id=65534)
+    with pytest.raises(InputError, match="above 65534, beyond pictures of 16 bits"):
+        render_map(tmp_path / "m.gsmap", tmp_path / "out", camera_file(tmp_path, ["a.jpg"]), ["rgb", "instances"])
     assert files(tmp_path) == set()
 
 
