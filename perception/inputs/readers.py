@@ -69,7 +69,8 @@ def _is_video(source: Path) -> bool:
     return source.suffix.lower() in VIDEO_SUFFIXES and source.is_file()
 
 
-def _is_splat(source: Path) -> bool:
+def is_splat(source: Path) -> bool:
+    """Whether a path is a file that may hold Gaussians, by its name."""
     return source.suffix.lower() in (".ply", ".spz") and source.is_file()
 
 
@@ -163,7 +164,7 @@ READERS = (
         poses=True,
     ),
     Reader("photos", Path.is_dir, lambda source: _sizes(list_photos(source)), list_photos, _read_photos),
-    Reader("splat", _is_splat, lambda source: PhotoSizes([], "no photos"), lambda source: [source], _refuse_splat),
+    Reader("splat", is_splat, lambda source: PhotoSizes([], "no photos"), lambda source: [source], _refuse_splat),
 )
 EXPECTED = (
     "a folder of photos, a video, a COLMAP workspace, a transforms.json, an RGB-D recording (TUM, ScanNet, 7-Scenes, "

@@ -33,14 +33,13 @@ import torch
 from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.train import Trainer
-from perception.inputs.readers import EXPECTED
+from perception.inputs.readers import EXPECTED, is_splat
 from perception.io.atomic import atomic_file, delete
 from perception.io.documents import brief, refusing
 from perception.machine import peak_memory_mib, refuse_full_disk
 from perception.map.replace import writing
 from perception.photos.video import FRAMES_RECORD
 from perception.progress import Progress
-from perception.splats.read import is_splat
 
 CHECKPOINT = "checkpoint.pt"
 BEFORE_MASKS = "before_masks.pt"

@@ -14,6 +14,7 @@ from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.model import Gaussians, HeldGaussians, Nearby
 from perception.gaussians.views import surface_depth
+from perception.inputs.readers import is_splat
 from perception.machine import require_memory, return_free_memory
 from perception.masks import MaskSource
 from perception.pipeline.checkpoint import FeatureCheckpoints, frames_folder
@@ -22,7 +23,7 @@ from perception.pipeline.optimise import Optimised, Photos, Run, label_by_tasks,
 from perception.sfm.options import ReadOptions
 from perception.splats.features import new_features, train_features
 from perception.splats.gravity import direction
-from perception.splats.read import Splat, is_splat, read_splat
+from perception.splats.read import Splat, read_splat
 from perception.splats.scene import drawn, splat_scene
 from perception.splats.surface import floaters
 from perception.types import Scene, View

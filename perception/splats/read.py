@@ -23,7 +23,6 @@ from perception.io.ply import Element, map_ply, ply_tables, read_ply
 from perception.splats.spz import read_spz
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
-SUFFIXES = (".ply", ".spz")
 LEAST_ROWS = 64
 """Gaussians that a scene needs: fewer are one blob, or nothing that instances could be found in."""
 LINEAR_SHARE = 0.05
@@ -59,11 +58,6 @@ class Splat:
     def arrays(self) -> dict[str, np.ndarray]:
         """The five arrays by name."""
         return {name: getattr(self, name) for name in NAMES}
-
-
-def is_splat(source: Path) -> bool:
-    """Whether a path is a file that may hold Gaussians, by its name."""
-    return source.suffix.lower() in SUFFIXES and source.is_file()
 
 
 def read_splat(path: Path, check: Callable[[int], None] = lambda count: None) -> Splat:

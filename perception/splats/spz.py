@@ -16,6 +16,7 @@ attributes' streams (compressed and not, 64 bits each), and those, by zstd. Axes
 from __future__ import annotations
 
 import gzip
+import io
 import struct
 import zlib
 from collections.abc import Callable
@@ -30,33 +31,38 @@ HEADER, HEADER_4 = "<IIIBBBB", "<IIIBBBBI12x"
 COLOR_SCALE = 0.15
 FLIPS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1, -1, 1, -1, 1, 1, -1, 1, -1, 1], np.float32)
 """Signs of the harmonics of degrees 1 to 4 when y and z change sign."""
+_DENSEST = 1032  # most bytes that a byte of gzip's code can stand for
 _EXPECTED = "expected a .spz file of version 1 to 4"
 
 
 def read_spz(path: Path, check: Callable[[int], None]) -> dict[str, np.ndarray]:
     """means [N, 3], quats [N, 4] wxyz, log_scales [N, 3], opacity_logits [N] and sh [N, K, 3] float32, with the axes of
-    a 3DGS PLY. check: is given N before these arrays are made. InputError for another version, and for a file that is
+    a 3DGS PLY. check: is given N before they are unpacked. InputError for another version, and for a file that is
     damaged or none."""
     try:
         data = path.read_bytes()
         plain = data[:4] == struct.pack("<I", MAGIC)
-        raw = data if plain else gzip.decompress(data)
-        magic, version, count, degree, bits, *_ = struct.unpack_from(HEADER, raw)
+        stream = io.BytesIO(data) if plain else gzip.GzipFile(fileobj=io.BytesIO(data))
+        magic, version, count, degree, bits, *_ = struct.unpack(HEADER, stream.read(struct.calcsize(HEADER)))
         if magic != MAGIC or degree > 4:
             raise InputError(f"{path}: is no .spz file; {_EXPECTED}, harmonics up to degree 4")
         if version not in VERSIONS or plain != (version == 4):
             raise InputError(f"{path}: is .spz of version {version}, versions 1 to 4 are read; save it as .ply")
         coefficients = (degree + 1) ** 2 - 1
         widths = (6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3, 3 * coefficients)
-        streams = _unpacked(raw, [count * width for width in widths]) if plain else raw[struct.calcsize(HEADER) :]
+        needed = count * sum(widths)
+        if not plain and needed > _DENSEST * len(data):
+            raise InputError(f"{path}: is cut short: it cannot hold the {count} Gaussians of its header; copy it anew")
+        check(count)
+        sizes = [count * width for width in widths]
+        streams = _unpacked(data, sizes) if plain else stream.read(needed + 1)  # to its end, where the checksum is
     except InputError:
         raise
     except (OSError, EOFError, zlib.error, struct.error, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({error}); {_EXPECTED}") from error
-    if len(streams) < count * sum(widths):
+    if len(streams) < needed:
         whole = len(streams) // sum(widths)
         raise InputError(f"{path}: is cut short: holds {whole} of the {count} Gaussians of its header; copy it anew")
-    check(count)
     parts, at = [], 0
     for width in widths:
         parts.append(np.frombuffer(streams, np.uint8, count * width, at).reshape(count, width))

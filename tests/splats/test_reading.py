@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import struct
+import tracemalloc
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -247,6 +248,19 @@ def test_spz_that_cannot_be_read_is_told(tmp_path: Path) -> None:
     ):
         file.write_bytes(data)
         assert words in refused(file)
+
+
+def test_spz_is_unpacked_no_farther_than_its_header_tells(tmp_path: Path) -> None:
+    good = gzip.decompress(spz_of(2)[0])
+    (tmp_path / "a.spz").write_bytes(gzip.compress(good + bytes(50 << 20)))
+    tracemalloc.start()
+    try:
+        assert len(read_splat(tmp_path / "a.spz")) == 100
+        assert tracemalloc.get_traced_memory()[1] < 2 << 20
+    finally:
+        tracemalloc.stop()
+    (tmp_path / "a.spz").write_bytes(gzip.compress(good[:8] + struct.pack("<I", 2**32 - 1) + good[12:]))
+    assert "cannot hold the 4294967295 Gaussians" in refused(tmp_path / "a.spz")
 
 
 def test_colours_between_0_and_1(tmp_path: Path) -> None:
