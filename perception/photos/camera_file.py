@@ -62,21 +62,27 @@ def lens_of(data: Any, where: object) -> Lens:
 
 
 def camera_info(message: Any, rectified: bool = False) -> dict[str, Any]:
-    """The camera_info of a ROS CameraInfo message (ROS 1 or 2). rectified: by its projection matrix P, or by K where P
-    is not set and there is no distortion; InputError where there is."""
+    """The camera_info of a ROS CameraInfo message (ROS 1 or 2), of its region of interest if the images are cut to one.
+    rectified: by its projection matrix P, or by K where P is not set and there is no distortion; InputError where
+    there is."""
 
     def field(name: str) -> list[float]:
         values = getattr(message, name.lower(), None)
         return [float(v) for v in (getattr(message, name.upper()) if values is None else values)]
 
     size, kind = (int(message.width), int(message.height)), str(message.distortion_model) or "plumb_bob"
-    P, distortion = field("p"), field("d")
+    K, P, distortion = field("k"), field("p"), field("d")
+    roi = getattr(message, "roi", None)
+    if roi is not None and roi.width and roi.height and (roi.width, roi.height) != size:
+        size, x, y = (int(roi.width), int(roi.height)), roi.x_offset, roi.y_offset
+        K = np.subtract(K, [0, 0, x, 0, 0, y, 0, 0, 0]).tolist()
+        P = np.subtract(P, [0, 0, x, 0, 0, 0, y, 0, 0, 0, 0, 0]).tolist()
     unset = len(P) < 12 or not np.isfinite(P).all() or min(P[0], P[5]) <= 0
     if rectified and unset and any(distortion):
         raise InputError("the camera_info of rectified images has distortion, and no projection matrix P")
     if rectified and not unset:
         return camera_data("camera", size, "plumb_bob", [*P[0:3], *P[4:7], *P[8:11]], [0.0] * 5)
-    return camera_data("camera", size, kind, field("k"), distortion)
+    return camera_data("camera", size, kind, K, distortion)
 
 
 def camera_data(name: str, size: tuple[int, int], kind: str, K: list[float], distortion: list[float]) -> dict[str, Any]:

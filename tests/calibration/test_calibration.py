@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -16,7 +17,7 @@ from perception.calibration.calibrate import _pictures, best_model, distinct_vie
 from perception.calibration.solve import NAMES, project, solve
 from perception.cli import main
 from perception.errors import InputError
-from perception.photos.camera_file import read_camera
+from perception.photos.camera_file import camera_info, lens_of, read_camera
 from perception.photos.lens import camera_from_lens
 from support.board_pictures import KnownCamera, board_views, render_board
 
@@ -267,3 +268,17 @@ def test_a_camera_that_was_turned_between_the_photos(turned: int, tmp_path) -> N
     words = "no charuco" if turned == 2 else r"1\.jpg was taken with the camera turned against 0\.jpg"
     with pytest.raises(InputError, match=words):
         run_calibration(tmp_path / "photos", tmp_path / "camera.yaml", CHARUCO)
+
+
+@pytest.mark.parametrize("rectified", [False, True])
+def test_a_region_of_interest_sees_what_the_sensor_sees_there(rectified: bool) -> None:
+    """CameraInfo states K and P of the whole sensor; the image of a region begins at its offset."""
+    values = {"k": [500, 0, 320, 0, 510, 240, 0, 0, 1], "p": [450, 0, 310, -9, 0, 460, 250, 0, 0, 0, 1, 0]}
+    rays, seen = np.array([[0.1, 0.05, 1], [-0.2, 0.1, 1]]), []
+    for region in ((0, 0, 0, 0), (40, 30, 320, 240), (0, 0, 640, 480)):
+        roi = SimpleNamespace(**dict(zip(("x_offset", "y_offset", "width", "height"), region, strict=True)))
+        values |= {"width": 640, "height": 480, "distortion_model": "plumb_bob", "d": [-0.2, 0.05, 0.001, 0.002, 0]}
+        lens = lens_of(camera_info(SimpleNamespace(**values, roi=roi), rectified), "/camera_info")
+        assert (lens.width, lens.height) == (region[2] or 640, region[3] or 480)
+        seen.append(camera_from_lens(lens).img_from_cam(rays) + region[:2])
+    np.testing.assert_allclose(seen, seen[:1] * 3, atol=1e-9)
