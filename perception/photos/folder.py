@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from perception.errors import InputError
-from perception.machine import cores
+from perception.machine import in_threads
 from perception.photos.decode import SUFFIXES, decode, open_photo, photo_size, to_rgb, upright
 from perception.photos.lens import resized
 from perception.photos.video import FRAMES_RECORD, THUMBNAIL, motion_between
@@ -123,12 +122,11 @@ def choose_photos(folder: Path, strict: bool, progress: Progress) -> PhotoSet:
     """
     paths = list_photos(folder)
     named: dict[str, _Look] = {}
-    with ThreadPoolExecutor(min(4, cores())) as pool:
-        for done, look in enumerate(pool.map(lambda path: _look(path, folder, strict), paths), start=1):
-            while look.name in named:  # an escaped name that is already in use
-                look.name += "_"
-            named[look.name] = look
-            progress.update("poses: photos", done, len(paths))
+    for done, look in enumerate(in_threads(lambda path: _look(path, folder, strict), paths), start=1):
+        while look.name in named:  # an escaped name that is already in use
+            look.name += "_"
+        named[look.name] = look
+        progress.update("poses: photos", done, len(paths))
     looks = list(named.values())
     _leave_out_panoramas([look for look in looks if look.why is None])
     _leave_out_doubles([look for look in looks if look.why is None])

@@ -76,9 +76,8 @@ class StoredView(View):
 def stored_view(view: View, folder: Path, held_out: bool = False, visit: int = 0) -> StoredView:
     """`view` with the record of its photo for the map at `folder`: both paths, and the size (None if missing)."""
     photo = absolute(view.photo)  # links are kept: the user names his photos by them
-    K, pose = np.asarray(view.K, np.float64), np.asarray(view.camera_from_world, np.float64)
-    own = (view.name, photo, K, view.width, view.height, pose, view.lens, held_out, None, None, view.gain)
-    return StoredView(*own, view.as_stored, _relative(photo, folder), _bytes(photo), visit)
+    record = {"photo": photo, "photo_beside": _relative(photo, folder), "photo_bytes": _bytes(photo), "visit": visit}
+    return StoredView(**vars(view) | record | {"held_out": held_out, "depth": None, "mask": None})
 
 
 def moved_record(view: StoredView, before: Path, after: Path) -> StoredView:
@@ -133,40 +132,31 @@ def view_json(view: View) -> dict[str, Any]:
     }
     if isinstance(view, StoredView):
         entry |= {name: getattr(view, name) for name in ("held_out", "photo_beside", "photo_bytes")}
-        entry |= {"visit": view.visit} if view.visit else {}
-    elif view.held_out:
-        entry["held_out"] = True
-    if view.as_stored:
-        entry["as_stored"] = True
-    if view.depth is not None:
-        entry["depth"] = [str(absolute(view.depth.path)), view.depth.scale, _lens_json(view.depth.lens)]
-    if view.gain is not None:
-        entry["gain"] = list(view.gain)
-    if view.mask is not None:
-        entry["mask"] = str(absolute(view.mask))
-    return entry
+    others = {
+        "held_out": view.held_out,
+        "visit": getattr(view, "visit", 0),
+        "as_stored": view.as_stored,
+        "depth": view.depth and [str(absolute(view.depth.path)), view.depth.scale, _lens_json(view.depth.lens)],
+        "gain": view.gain and list(view.gain),
+        "mask": view.mask and str(absolute(view.mask)),
+    }
+    return entry | {name: value for name, value in others.items() if value}
 
 
 def view_from_json(entry: dict[str, Any]) -> StoredView:
     """The inverse of `view_json`. ValueError for an invalid entry."""
     check(VIEW, entry)
-    beside, size, depth, mask, gain = map(entry.get, ("photo_beside", "photo_bytes", "depth", "mask", "gain"))
+    depth, mask, gain = map(entry.get, ("depth", "mask", "gain"))
+    plain = ("name", "width", "height", "held_out", "as_stored", "photo_beside", "photo_bytes", "visit")
     return StoredView(
-        entry["name"],
-        Path(entry["photo"]),
-        np.array(entry["K"], np.float64),
-        entry["width"],
-        entry["height"],
-        np.array(entry["camera_from_world"], np.float64),
-        _lens_of(entry.get("lens")),
-        entry.get("held_out", False),
-        None if depth is None else DepthImage(Path(depth[0]), float(depth[1]), _lens_of(depth[2])),
-        None if mask is None else Path(mask),
-        None if gain is None else (float(gain[0]), float(gain[1]), float(gain[2])),
-        entry.get("as_stored", False),
-        beside,
-        size,
-        entry.get("visit", 0),
+        photo=Path(entry["photo"]),
+        K=np.array(entry["K"], np.float64),
+        camera_from_world=np.array(entry["camera_from_world"], np.float64),
+        lens=_lens_of(entry.get("lens")),
+        depth=None if depth is None else DepthImage(Path(depth[0]), float(depth[1]), _lens_of(depth[2])),
+        mask=None if mask is None else Path(mask),
+        gain=None if gain is None else (float(gain[0]), float(gain[1]), float(gain[2])),
+        **{name: entry[name] for name in plain if name in entry},
     )
 
 
