@@ -38,7 +38,7 @@ def export_splat(
     for number in (*only, *without):
         if number not in known:
             raise InputError(f"{map_path}: has no Gaussians of an instance {number}; `perception query` tells ids")
-    rows = _rows(gmap, map_path)
+    rows = _rows(gmap)
     wanted = [number for number in only or known if number not in without]
     files = {output: np.isin(ids, wanted) if only else ~np.isin(ids, without)}
     if each:
@@ -53,10 +53,11 @@ def export_splat(
     return {"splat": written, "gaussians": len(ids)}, "\n".join(lines)
 
 
-def _rows(gmap: Map, map_path: Path) -> np.ndarray:
+def _rows(gmap: Map) -> np.ndarray:
     """The rows of the map's Gaussians: of the input's file where these are the same but for rows that are no numbers,
     which a map does not hold; else of the map."""
-    own = map_ply(map_path / "gaussians.ply", "vertex")
+    assert gmap.files is not None  # for the type checker
+    own = gmap.files.rows
     source = Path(str(gmap.info.get("source", "")))
     if gmap.info.get("scene", {}).get("input") != "splat" or not source.is_file():
         return own

@@ -36,6 +36,7 @@ class MapFiles:
     Files are opened (memory-mapped) by the constructor and stay open, so a replaced or deleted map can still be read
     through this object. Truncating a mapped file in place, which no writer of this package does, crashes the reader.
     facts: map.json. info: facts without the views. instances: the list of instances.json. map_id: hash of both files.
+    rows: of gaussians.ply, as it is.
     """
 
     def __init__(self, path: Path):
@@ -65,18 +66,18 @@ class MapFiles:
         self.instances, raw = _read_instances(self.path / EDITABLE, facts)
         self.map_id = hashlib.sha256(raw_facts + b"\0" + raw).hexdigest()[:12]
         try:
-            self._rows = map_ply(self.path / "gaussians.ply", "vertex")
+            self.rows = map_ply(self.path / "gaussians.ply", "vertex")
             self._arrays = {name: self._map_array(name, sides) for name, sides in _ARRAYS.items()}
             archives = {name: self.path / f"{name}.npz" for name in ARCHIVES}
             self._archives = {name: file.read_bytes() for name, file in archives.items() if file.is_file()}
         except OSError as error:
             raise damaged(self.path, str(error)) from error
-        if len(self._rows) != facts["num_gaussians"]:
-            rows = f"num_gaussians: gaussians.ply holds {len(self._rows)}, found {facts['num_gaussians']}"
+        if len(self.rows) != facts["num_gaussians"]:
+            rows = f"num_gaussians: gaussians.ply holds {len(self.rows)}, found {facts['num_gaussians']}"
             raise damaged(self.path / FACTS, rows)
         for name, array in self._arrays.items():
-            if len(array) != len(self._rows):
-                rows = f"holds {len(array)} rows, expected {len(self._rows)} as in gaussians.ply"
+            if len(array) != len(self.rows):
+                rows = f"holds {len(array)} rows, expected {len(self.rows)} as in gaussians.ply"
                 raise damaged(self.path / f"{name}.npy", rows)
 
     def _map_array(self, name: str, sides: int) -> np.ndarray:
@@ -104,7 +105,7 @@ class MapFiles:
             file, raw = self.path / f"{name}.npz", self._archives.get(name)
             arrays = {} if raw is None else read_npz(raw, file, "the map is damaged, build it again")
             with _damage_in(file):
-                check_archive(name, arrays, self.instances, len(self._rows))
+                check_archive(name, arrays, self.instances, len(self.rows))
             return arrays
         self._check_contents()
         if name == "instance_ids":
@@ -112,7 +113,7 @@ class MapFiles:
                 check_ids(self._arrays[name], [e["id"] for e in self.instances if not is_removed(e)])
         file = self.path / (f"{name}.npy" if name in _ARRAYS else "gaussians.ply")
         try:
-            values = np.array(self._arrays[name]) if name in _ARRAYS else _OF_PLY[name](self._rows)
+            values = np.array(self._arrays[name]) if name in _ARRAYS else _OF_PLY[name](self.rows)
         except (KeyError, ValueError) as error:
             raise damaged(file, f"is no 3DGS cloud ({error})") from error
         if np.isnan(values).any() or (name == "means" and np.isinf(values).any()):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from perception.export.export_map import ExportOptions, export_map
 from perception.export.splat import export_splat
 from perception.io.cloud import read_cloud
 from perception.io.ply import map_ply, write_ply
+from perception.map.map import Map
 from perception.map.write import write_map
 from perception.splats.read import read_splat
 from support.viewer_maps import small_map
@@ -116,3 +118,20 @@ def test_rows_of_a_splat_that_are_no_numbers_come_back(name: str, tmp_path: Path
     back = map_ply(tmp_path / "out.ply", "vertex")
     for key, values in given.items():
         np.testing.assert_array_equal(back[key], values)
+
+
+def test_a_map_that_is_replaced_meanwhile_is_exported_as_it_was(tmp_path: Path, monkeypatch: Any) -> None:
+    """Rows of one map would have the ids of another."""
+    before, path, open_map = small_map(80), tmp_path / "m.gsmap", Map.open
+
+    def opened(folder: Path) -> Map:
+        gmap = open_map(folder)
+        write_map(folder, small_map(60))
+        return gmap
+
+    write_map(path, before)
+    monkeypatch.setattr(Map, "open", staticmethod(opened))
+    export_splat(path, tmp_path / "out.ply")
+    back = map_ply(tmp_path / "out.ply", "vertex")
+    np.testing.assert_array_equal(back["x"], before.means[:, 0].astype(np.float32))
+    np.testing.assert_array_equal(back["instance_id"], before.instance_ids)
