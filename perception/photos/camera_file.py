@@ -72,8 +72,11 @@ def camera_info(message: Any, rectified: bool = False) -> dict[str, Any]:
 
     size, kind = (int(message.width), int(message.height)), str(message.distortion_model) or "plumb_bob"
     K, P, distortion = field("k"), field("p"), field("d")
-    roi = getattr(message, "roi", None)
-    if roi is not None and roi.width and roi.height and (roi.width, roi.height) != size:
+    roi, binned = (
+        getattr(message, "roi", None),
+        getattr(message, "binning_x", 0) > 1,
+    )  # stated as a region, too
+    if roi is not None and not binned and roi.width and roi.height and (roi.width, roi.height) != size:
         size, x, y = (int(roi.width), int(roi.height)), roi.x_offset, roi.y_offset
         K = np.subtract(K, [0, 0, x, 0, 0, y, 0, 0, 0]).tolist()
         P = np.subtract(P, [0, 0, x, 0, 0, 0, y, 0, 0, 0, 0, 0]).tolist()

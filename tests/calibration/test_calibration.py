@@ -282,3 +282,6 @@ def test_a_region_of_interest_sees_what_the_sensor_sees_there(rectified: bool) -
         assert (lens.width, lens.height) == (region[2] or 640, region[3] or 480)
         seen.append(camera_from_lens(lens).img_from_cam(rays) + region[:2])
     np.testing.assert_allclose(seen, seen[:1] * 3, atol=1e-9)
+    halves = SimpleNamespace(x_offset=0, y_offset=0, width=320, height=240)  # as some drivers state binning by two
+    data = camera_info(SimpleNamespace(**values, roi=halves, binning_x=2), rectified)
+    assert (data["image_width"], data["image_height"]) == (640, 480)
