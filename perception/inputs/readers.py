@@ -28,6 +28,7 @@ from perception.sfm.options import ReadOptions
 from perception.sfm.reconstruct import reconstruct
 from perception.types import Scene
 
+COLMAP, JSON, RECORDING, PHOTOS = "COLMAP model", "JSON with frames", "RGB-D recording", "photos"
 SENSOR_SIZE = (640, 480)
 """Width and height taken for the frames of a recording whose first cannot be read."""
 
@@ -138,7 +139,7 @@ def _refuse_splat(source: Path, options: ReadOptions) -> Scene:
 READERS = (
     Reader("video", _is_video, _video_sizes, lambda source: [source], _read_video),
     Reader(
-        "COLMAP model",
+        COLMAP,
         lambda source: bool(models_below(source)),
         lambda source: _sizes(model_photos(source)),
         lambda source: [*model_photos(source), *model_files(source)],
@@ -147,7 +148,7 @@ READERS = (
         cameras=True,
     ),
     Reader(
-        "JSON with frames",
+        JSON,
         lambda source: bool(transforms_files(source)),
         lambda source: _sizes(*listed_photos(source)),
         listed_files,
@@ -156,14 +157,14 @@ READERS = (
         cameras=True,
     ),
     Reader(
-        "RGB-D recording",
+        RECORDING,
         lambda source: layout_of(source) is not None,
         _recording_sizes,
         _recording_files,
         lambda source, options: recordings.recorded_scene(open_recording(source), options),
         poses=True,
     ),
-    Reader("photos", Path.is_dir, lambda source: _sizes(list_photos(source)), list_photos, _read_photos),
+    Reader(PHOTOS, Path.is_dir, lambda source: _sizes(list_photos(source)), list_photos, _read_photos),
     Reader("splat", is_splat, lambda source: PhotoSizes([], "no photos"), lambda source: [source], _refuse_splat),
 )
 EXPECTED = (
@@ -196,17 +197,16 @@ def other_inputs(source: Path, reader: Reader) -> list[str]:
     """A line on what folder `source`, read by `reader`, holds besides, and one on poses that lie beside it."""
     if not source.is_dir():
         return []
-    kinds = [reader.name for reader in READERS]
     lines = [f"its poses are not read: {fault}" for fault in faults(source)]
-    used = transforms_files(source) if reader.name == kinds[2] else []
+    used = transforms_files(source) if reader.name == JSON else []
     others = [path.relative_to(source).as_posix() for path in json_files(source) if path not in used]
-    if reader.name in kinds[1:3] and layout_of(source) is not None:
-        others.append(f"an {kinds[3]}")
+    if reader.name in (COLMAP, JSON) and layout_of(source) is not None:
+        others.append(f"an {RECORDING}")
     others += [path.name for pattern in UNREAD for path in sorted(source.glob(pattern))]
     if others:
-        order = ", ".join(kinds[1:])
+        order = ", ".join(kind.name for kind in READERS[1:])
         lines.append(f"{source}: read as {reader.name}; not read: {', '.join(others)} (order of preference: {order})")
-    if reader.name == kinds[4]:
+    if reader.name == PHOTOS:
         above = source.absolute().parent
         beside = [above / "sparse"] if models_below(above / "sparse") else []
         beside += [path for path in json_files(above) if path.name.startswith("transforms")]

@@ -281,7 +281,7 @@ def _numbers(file: BinaryIO) -> np.ndarray:
 
 
 def _cast(values: np.ndarray, kind: str) -> np.ndarray:
-    with np.errstate(invalid="ignore"):  # a text may hold nan of type int
+    with np.errstate(invalid="ignore", over="ignore"):  # a text may hold nan of type int, and 1e400
         return values.astype(kind, copy=False)
 
 

@@ -126,8 +126,10 @@ def _given(cameras: Path, options: ReadOptions) -> tuple[list[View], list[str]]:
     if reader.sizes(cameras).sizes:
         scene = reader.read(cameras, replace(options, poses="keep", still=False))
         return scene.views, [f"{len(scene.views)} photos with poses of {cameras}"]
-    frames = [frame for file in transforms_files(cameras) for frame in read_frames(file)]
-    frames = model_frames(cameras) if models_below(cameras) else frames
+    if models_below(cameras):
+        frames = model_frames(cameras)
+    else:
+        frames = [frame for file in transforms_files(cameras) for frame in read_frames(file)]
     views = [make_view(f"given/{n:04d}.png", Path(), lens, pose, cameras) for n, (_, pose, lens) in enumerate(frames)]
     return views, [f"{len(views)} poses without photos of {cameras}"]
 

@@ -69,6 +69,7 @@ def test_a_folder_without_its_photos_gives_its_poses(kind: str, tmp_path: Path) 
         sparse.mkdir(parents=True)
         (sparse / "cameras.txt").write_text(f"1 SIMPLE_RADIAL {WIDTH} {HEIGHT} {FOCAL} {WIDTH / 2} {HEIGHT / 2} 0.01\n")
         (sparse / "points3D.txt").write_text("")
+        (tmp_path / "transforms.json").write_text("{")  # not read beside a model
         (sparse / "images.txt").write_text("3 0.5 0.5 0.5 0.5 7 8 9 1 b.jpg\n\n1 1 0 0 0 1 2 3 1 a.jpg\n\n")
     views, notes = _given(tmp_path, ReadOptions(tmp_path / "sfm"))
     assert len(views) == (4 if kind == "json" else 2) and "poses without photos" in notes[0]
