@@ -49,7 +49,7 @@ class Model:
     wrong: dict[int, str] = field(default_factory=dict)
     cameras: dict[int, str] = field(default_factory=dict)
     frames: dict[int, str] = field(default_factory=dict)
-    copies: dict[str, bytes] = field(default_factory=dict)
+    copies: dict[str, bytearray] = field(default_factory=dict)
     reconstruction: Any = None
 
     def file(self, kind: str) -> Path:
@@ -148,7 +148,7 @@ def _checked_text(model: Model) -> dict[int, int]:
         text |= {"cameras": "\n".join(cameras), "images": "\n".join(images)}
         text |= {"frames": "\n".join(frames)} if frames else {}
         text["points3D"] = re.sub(r"-?1\.#\w+", "nan", text["points3D"])
-        model.copies = {kind: f"{content}\n".encode() for kind, content in text.items()}
+        model.copies = {kind: bytearray(f"{content}\n", "utf-8") for kind, content in text.items()}
     return used
 
 
@@ -241,9 +241,9 @@ def _heads(model: Model, kind: str) -> list[tuple[int, int]]:
             raise ValueError("the file is cut short")
 
     def replace(layout: Struct, start: int, values: Sequence[float]) -> None:
-        copy = bytearray(model.copies.get(kind, data))
-        layout.pack_into(copy, start, *values)
-        model.copies[kind] = bytes(copy)
+        if kind not in model.copies:
+            model.copies[kind] = bytearray(data)
+        layout.pack_into(model.copies[kind], start, *values)
 
     try:
         for _ in range(take(_COUNT)[0]):

@@ -16,7 +16,7 @@ from perception.photos.decode import read_picture
 from perception.photos.depth import read_depth
 from perception.photos.ignore_masks import mask_of
 from perception.photos.video import MOST_FRAMES, Chooser
-from perception.photos.views import first_of, posed_view, rigid_pose, without_far
+from perception.photos.views import first_of, leaving_out, posed_view, rigid_pose, without_far
 from perception.posed.triangulate import posed_scene
 from perception.progress import Progress
 from perception.sfm.options import NO_CLOUD, ReadOptions
@@ -58,8 +58,7 @@ class Recording:
 def recorded_scene(recording: Recording, options: ReadOptions) -> Scene:
     """The chosen frames of a recording as a Scene in its own world, whose unit is the metre.
     Frames with a pose that is not rigid or far from all others, and with a photo that is damaged or does not fit the
-    lens, are left out. InputError for a missing lens, and depth
-    whose unit cannot be right."""
+    lens, are left out. InputError for a missing lens, and for depth whose unit cannot be right."""
     source, kind, lens = recording.source, recording.kind, options.lens or recording.lens
     if not recording.frames:
         raise InputError(f"{source}: a recording as of {kind}, but no frame has both photo and pose")
@@ -71,21 +70,16 @@ def recorded_scene(recording: Recording, options: ReadOptions) -> Scene:
     chosen, damaged = choose_frames(recording, lens, options.progress, options.strict)
     views, unfit = list[View](), list[dict[str, str]]()
     for frame in chosen:
-        try:
+        with leaving_out(unfit, frame.name, options.strict):
             views.append(_view(recording, frame, lens, options.masks))
-        except InputError as error:
-            if options.strict:
-                raise
-            unfit.append({"name": frame.name, "why": str(error)})
     if not views:
         raise InputError(f"{source}: none of the {len(chosen)} chosen photos can be used{first_of(unfit)}")
     cloud = options.cloud or NO_CLOUD
     views, far = without_far(views, cloud[0], set(), options.strict, source)
-    unread = [{"name": name, "why": "the photo cannot be read"} for name in damaged]
     taken = f"{len(chosen)} of {len(recording.frames)} frames chosen, sharp and well spaced"
     facts: dict[str, Any] = {
         "input": kind,
-        "left_out": [*wrong, *unread, *unfit, *far],
+        "left_out": [*wrong, *damaged, *unfit, *far],
         "notes": [f"{source}: {kind}, {taken}", *recording.notes],
         "warnings": recording.warnings,
         "mean_reprojection_error_px": None,
@@ -99,31 +93,26 @@ def _with_poses(recording: Recording, strict: bool) -> tuple[Recording, list[dic
     """The recording without the frames whose pose is not rigid, and these as left out; InputError if none is left."""
     good, wrong = list[Frame](), list[dict[str, str]]()
     for frame in recording.frames:
-        try:
+        with leaving_out(wrong, frame.name, strict):
             rigid_pose(frame.world_from_camera, f"{recording.source}: the pose of {frame.name}")
             good.append(frame)
-        except InputError as error:
-            if strict:
-                raise
-            wrong.append({"name": frame.name, "why": str(error)})
     if not good:
         raise InputError(f"{recording.source}: none of the {len(wrong)} photos has a usable pose{first_of(wrong)}")
     return replace(recording, frames=good), wrong
 
 
-def choose_frames(recording: Recording, lens: Lens, progress: Progress, strict: bool) -> tuple[list[Frame], list[str]]:
-    """At most MOST_FRAMES frames: the sharpest of each stretch of motion (see `Chooser`); names of unreadable photos.
+def choose_frames(
+    recording: Recording, lens: Lens, progress: Progress, strict: bool
+) -> tuple[list[Frame], list[dict[str, str]]]:
+    """At most MOST_FRAMES frames: the sharpest of each stretch of motion (see `Chooser`); those that are unreadable.
     The motion between frames, as a share of the width, is that of their poses: f / width (angle + distance / depth)."""
     share, depth = lens.params[0] / lens.width, median_depth(recording)
-    chooser, shown, damaged = Chooser(), list[Frame](), list[str]()
-    what = "photo; replace or remove it"
+    chooser, shown, damaged = Chooser(), list[Frame](), list[dict[str, str]]()
     for done, frame in enumerate(recording.frames, start=1):
-        try:
+        picture, what = None, "photo; replace or remove it"
+        with leaving_out(damaged, frame.name, strict):
             picture = read_picture(frame.photo, frame.photo, what, cv2.IMREAD_REDUCED_COLOR_2)
-        except InputError:
-            if strict:
-                raise
-            damaged.append(frame.name)
+        if picture is None:
             continue
         motion = 0.0
         if shown:

@@ -22,7 +22,7 @@ from perception.photos.ignore_masks import mask_of
 from perception.photos.lens import FISHEYE, PERSPECTIVE, camera_from_lens, opencv_lens
 from perception.photos.named_files import NamedFiles
 from perception.photos.view_json import absolute, refuse_other_frame
-from perception.photos.views import first_of, posed_view, rigid_pose, without_far
+from perception.photos.views import first_of, leaving_out, posed_view, rigid_pose, without_far
 from perception.posed.triangulate import posed_scene
 from perception.sfm.options import NO_CLOUD, ReadOptions
 from perception.types import DepthImage, Lens, Scene, View
@@ -223,14 +223,13 @@ def _views(
         if name in views:
             notes.add(f"{name} is listed more than once; the first pose is used")
             continue
-        try:
+        posed = None
+        with leaving_out(missing, name, options.strict):
             lens, pose = _lens(frame.file, values, photo), _pose(frame.file, values)
-            view, note = posed_view(name, photo, lens, pose, frame.file)
-        except InputError as error:
-            if options.strict:
-                raise
-            missing.append({"name": name, "why": str(error)})
+            posed = posed_view(name, photo, lens, pose, frame.file)
+        if posed is None:
             continue
+        view, note = posed
         mask = mask_of(options.masks, name)
         if mask is None and values.get("mask_path"):
             mask = listing.needed(frame.file, "mask", values["mask_path"])

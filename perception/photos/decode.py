@@ -225,8 +225,6 @@ def _grid(view: View, lens: Lens, width: int, height: int) -> tuple[np.ndarray, 
 def _oriented(view: View) -> np.ndarray:
     width, height = view.photo_size
     photo = read_photo(view.photo, view.as_stored)
-    if photo.shape[:2] != (height, width) and photo_size(view.photo, as_stored=True) == view.photo_size:
-        photo = read_photo(view.photo, as_stored=True)  # maps of version 1.0 do not have `as_stored`
     if photo.shape[:2] == (height, width):
         return photo
     found = "×".join(map(str, photo.shape[1::-1]))

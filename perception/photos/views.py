@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -98,6 +100,17 @@ def without_far(
     if out and strict:
         raise InputError(f"{source}: the camera of {out[0]['name']} {out[0]['why']}; repair or remove it")
     return [view for view, is_far in zip(views, far, strict=True) if not is_far], out
+
+
+@contextmanager
+def leaving_out(left_out: list[dict[str, str]], name: str, strict: bool) -> Iterator[None]:
+    """For one photo of many: adds it to those left out, and why, where the block raises InputError; strict: raised."""
+    try:
+        yield
+    except InputError as error:
+        if strict:
+            raise
+        left_out.append({"name": name, "why": str(error)})
 
 
 def first_of(left_out: list[dict[str, str]]) -> str:
