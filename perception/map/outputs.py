@@ -45,8 +45,9 @@ def check_empty(output: Path) -> None:
         raise InputError(f"{output}: is not empty, or no folder; choose another -o or remove it first")
 
 
-def check_side_file(side: Path, output: Path, key: str = "") -> None:
-    """InputError if `side`, to be written beside `output`, is something else: JSON without `key`, .npy without ids."""
+def check_side_file(side: Path, output: Path, key: str) -> None:
+    """InputError if `side`, to be written beside `output`, is something else: JSON without a text or an object at `key`
+    (a map's instances.json has a list), .npy without ids."""
     if not os.path.lexists(side):
         return
     try:
@@ -56,12 +57,13 @@ def check_side_file(side: Path, output: Path, key: str = "") -> None:
             ids = np.load(side, mmap_mode="r")
             good = ids.dtype == np.int32 and ids.ndim == 1
         else:
-            good = key in json.loads(side.read_bytes())
-    except (OSError, ValueError, TypeError, EOFError, RecursionError):
+            found = json.loads(side.read_bytes())
+            good = isinstance(found, dict) and isinstance(found.get(key), (str, dict))
+    except (OSError, ValueError, EOFError, RecursionError):
         good = False
     if not good:
-        found = f"lies there, and is not of a file such as {output.name}, beside which it would be replaced"
-        raise InputError(f"{side}: {found}; choose another name for the output")
+        what = f"lies there, and is not of a file such as {output.name}, beside which it would be replaced"
+        raise InputError(f"{side}: {what}; choose another name for the output")
 
 
 def _identities(file: Path) -> Iterator[Any]:

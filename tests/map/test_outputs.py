@@ -100,6 +100,10 @@ def test_exports_lie_in_a_maps_folder_and_are_written_anew(place: Path) -> None:
     refuse_inputs([place / "m.gsmap" / "report.html"], [place / "m.gsmap"])
     (place / "ids.npy").write_bytes((place / "m.gsmap" / "features.npy").read_bytes())
     assert main(["export", "m.gsmap", "-o", "ids.spz"]) == 2
+    copy = place / "instances.json"  # of a map: with the list of them, not with what an export says of each
+    copy.write_bytes((place / "m.gsmap" / copy.name).read_bytes())
+    before = contents(place)
+    assert main(["export", "m.gsmap", "-o", "instances.ply"]) == 2 and contents(place) == before
 
 
 def test_pictures_of_photos_with_one_stem_get_names_of_their_own(place: Path) -> None:
