@@ -117,7 +117,7 @@ def video_frames(video: Path, folder: Path, progress: Progress) -> dict[str, obj
 def frames(
     video: Path, wanted: set[int] | None = None, most: int | None = None
 ) -> Iterator[tuple[int, float, np.ndarray]]:
-    """(number, share of the video, BGR [h, w, 3] uint8) of the `wanted` frames, upright.
+    """(number, share of the way, BGR [h, w, 3] uint8) of the `wanted` frames, upright.
     Without `wanted`, every n-th frame: LOOKS_PER_SECOND, or about `most` in all. None where the video is unreadable."""
     if os.fsencode(video) != str(video).encode(errors="replace"):  # OpenCV would crash
         raise InputError(f"{video}: the path holds bytes that are no UTF-8; rename the video")
@@ -127,16 +127,29 @@ def frames(
             width, height = (int(capture.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
             check_size(video, (width, height), None, 0)
             capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
-            rate, total = capture.get(cv2.CAP_PROP_FPS), max(1.0, capture.get(cv2.CAP_PROP_FRAME_COUNT))
+            rate, total = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
+            if wanted is not None:
+                total = max(wanted) + 1
+            elif not total >= 1:  # browsers record without stating it
+                total = _counted(video)
             step = max(1, round(rate / LOOKS_PER_SECOND)) if np.isfinite(rate) else 1
             step = step if most is None else max(1, int(total) // most)
             number = 0
-            while capture.grab():
+            while (wanted is None or number < total) and capture.grab():
                 if number in wanted if wanted is not None else number % step == 0:
                     good, frame = capture.retrieve()
                     if good:
                         yield number, min(1.0, (number + 1) / total), frame
                 number += 1
+    finally:
+        capture.release()
+
+
+def _counted(video: Path) -> int:
+    """The number of frames, by decoding all."""
+    capture = cv2.VideoCapture(str(video))
+    try:
+        return sum(1 for _ in iter(capture.grab, False))
     finally:
         capture.release()
 

@@ -15,7 +15,7 @@ from PIL import Image
 from perception.errors import InputError
 from perception.inputs.load import load_scene, photo_sizes
 from perception.photos.folder import list_photos
-from perception.photos.video import FRAMES_RECORD, frame_size, video_frames
+from perception.photos.video import FRAMES_RECORD, frame_size, frames, video_frames
 from perception.pipeline.checkpoint import frames_folder, working
 from perception.progress import QUIET
 from perception.sfm.options import ReadOptions
@@ -69,6 +69,17 @@ def test_videos_of_phones_and_camcorders(name: str, tmp_path: Path) -> None:
         writer.write(frame)
     writer.release()
     assert photo_sizes(tmp_path / name).sizes[0] == (160, 120)
+
+
+def test_a_video_that_does_not_state_its_length(tmp_path: Path) -> None:
+    """As browsers record: OpenCV tells a negative number of frames."""
+    file = tmp_path / "v.avi"
+    file.write_bytes(b"".join(cv2.imencode(".jpg", frame)[1].tobytes() for frame in pan(40)))
+    assert cv2.VideoCapture(str(file)).get(cv2.CAP_PROP_FRAME_COUNT) < 0
+    numbers, shares, _ = zip(*frames(file), strict=True)
+    np.testing.assert_allclose(shares, (np.array(numbers) + 1) / 40)
+    assert [number for number, _, _ in frames(file, most=8)] == [0, 5, 10, 15, 20, 25, 30, 35]
+    assert [(number, share) for number, share, _ in frames(file, {3, 7})] == [(3, 0.5), (7, 1.0)]
 
 
 def test_files_that_are_no_video(tmp_path: Path) -> None:
