@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,11 @@ from perception.gaussians.views import expected_depth, psnr, render
 from perception.inputs.colmap import model_frames, models_below
 from perception.inputs.readers import reader_of
 from perception.inputs.transforms import read_frames, transforms_files
+from perception.io.atomic import write_file
+from perception.io.documents import read_json
+from perception.map.outputs import check_empty
 from perception.photos.decode import load_photo, scaled_K
+from perception.photos.video import FRAMES_RECORD
 from perception.photos.views import make_view
 from perception.sfm.options import ReadOptions
 from perception.splats.cameras import FOCAL, choose_views, intrinsics
@@ -57,7 +63,9 @@ def splat_scene(
     splat: Splat, gaussians: Gaussians, hidden: np.ndarray, folder: Path, config: MapConfig, options: ReadOptions
 ) -> Scene:
     """Views of the scene in the splat's own frame: those of `splat.cameras` first, then virtual ones. gaussians: as
-    they are drawn. Renders and depth are written to `folder`. InputError for cameras that see nothing of the scene."""
+    they are drawn. Renders and depth are written to `folder`. InputError for cameras that see nothing of the scene, and
+    as `claim`."""
+    claim(folder, splat, config)
     side, cameras = config.photos.max_side, None if config.splat.cameras is None else Path(config.splat.cameras)
     means = splat.means[~hidden].astype(np.float64)
     points, colors = _cloud(splat, hidden)
@@ -88,6 +96,17 @@ def splat_scene(
     if metric:
         report["scale"] = {"metres_per_unit": 1.0, "source": "--unit metre", "standard_error": None}
     return Scene(sorted(views, key=lambda view: view.name), points, colors, metric, report=report)
+
+
+def claim(folder: Path, splat: Splat, config: MapConfig) -> None:
+    """Makes the folder for renders, with a record of what they show. InputError where it holds other files, such as the
+    renders of another scene or of other settings: they may be photos of a map that was renamed since."""
+    rendered_by = json.dumps([config.splat.model_dump(), config.photos.max_side]).encode()
+    record = {"splat": hashlib.sha256(splat.means.tobytes() + splat.sh.tobytes() + rendered_by).hexdigest()[:16]}
+    listed = folder / FRAMES_RECORD
+    if not listed.is_file() or read_json(listed) != record:
+        check_empty(folder)
+    write_file(listed, json.dumps(record), parents=True)
 
 
 def _virtual(poses: np.ndarray, gaussians: Gaussians, width: int, folder: Path) -> list[View]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,12 +11,13 @@ import numpy as np
 import pytest
 import torch
 
+from perception.config import MapConfig, PhotoConfig
 from perception.errors import InputError
 from perception.photos.depth import load_depth
 from perception.sfm.options import ReadOptions
 from perception.splats.panoramas import pose_at
 from perception.splats.read import Splat, read_splat
-from perception.splats.scene import _cloud, _given, _with_renders, drawn
+from perception.splats.scene import _cloud, _given, _with_renders, claim, drawn
 from perception.types import View
 from support.splat_rooms import SIDES, room_columns, write_room
 
@@ -78,6 +80,21 @@ def test_a_folder_without_its_photos_gives_its_poses(kind: str, tmp_path: Path) 
         cycle = np.array([[0.0, 0, 1, 7], [1, 0, 0, 8], [0, 1, 0, 9], [0, 0, 0, 1]])  # 120° about 1, 1, 1
         expected = [np.block([[np.eye(3), np.array([[1], [2], [3]])], [np.zeros((1, 3)), 1]]), cycle]
         np.testing.assert_allclose([view.camera_from_world for view in views], expected, atol=1e-12)
+
+
+def test_renders_of_another_scene_are_not_replaced(room: Splat, tmp_path: Path) -> None:
+    """Their map may have been renamed since: they are its photos."""
+    folder, config = tmp_path / "a.gsmap.frames", MapConfig()
+    for _ in range(2):  # a run that was stopped goes on
+        claim(folder, room, config)
+    (folder / "virtual").mkdir()
+    for other in (replace(room, means=room.means + 1), replace(room, sh=room.sh + 1)):
+        with pytest.raises(InputError, match=r"a\.gsmap\.frames: is not empty"):
+            claim(folder, other, config)
+    with pytest.raises(InputError, match="is not empty"):
+        claim(folder, room, config.model_copy(update={"photos": PhotoConfig(max_side=200)}))
+    (tmp_path / "own").mkdir()
+    claim(tmp_path / "own", room, config)
 
 
 def test_photos_that_do_not_fit_their_cameras_are_told(tmp_path: Path) -> None:
