@@ -3,6 +3,8 @@ or chosen ones."""
 
 from __future__ import annotations
 
+import contextlib
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.ply import map_ply, write_ply
+from perception.io.ply import map_ply, ply_tables, write_ply
 from perception.map.history import is_removed
 from perception.map.map import Map
 from perception.map.outputs import refuse_inputs
@@ -29,7 +31,8 @@ def export_splat(
     """Writes the rows of a map's Gaussians in their order, their properties byte for byte, and instance_id int32,
     −1 = none. only, without: ids of the instances that are written, or left out. each: a file for every instance
     (of `only`), OUT-ID.ply. A map of a splat gives back the properties of its file that no map holds, if the file lies
-    where it lay. inputs: files that this must not write. Returns (facts, text). InputError for an unknown id."""
+    where it lay. inputs: files that this must not write. Returns (facts, text). InputError for an unknown id, and for a
+    file that lies at OUT-ID.ply and has no instance_id."""
     if output.suffix.lower() != ".ply":
         raise InputError(f"{output}: expected a file OUT.ply for --splat; -o OUT.spz writes compressed Gaussians")
     gmap = Map.open(map_path)
@@ -43,6 +46,9 @@ def export_splat(
     files = {output: np.isin(ids, wanted) if only else ~np.isin(ids, without)}
     if each:
         files = {output.with_name(f"{output.stem}-{number}.ply"): ids == number for number in wanted}
+        for file in filter(os.path.lexists, files):  # the user named none of them
+            if not _is_export(file):
+                raise InputError(f"{file}: lies there, and is of no such export; choose another name for --splat")
     refuse_inputs(files, [map_path, *inputs])
     written = {}
     for file, mask in files.items():
@@ -51,6 +57,12 @@ def export_splat(
         written[str(file)] = int(mask.sum())
     lines = [f"{file}: {count} of {len(ids)} Gaussians" for file, count in written.items()]
     return {"splat": written, "gaussians": len(ids)}, "\n".join(lines)
+
+
+def _is_export(file: Path) -> bool:
+    with contextlib.suppress(InputError):
+        return file.is_file() and any(p.name == ID for table in ply_tables(file) for p in table.properties)
+    return False
 
 
 def _rows(gmap: Map) -> np.ndarray:

@@ -98,6 +98,13 @@ def test_what_is_gone_has_no_splat(tmp_path: Path) -> None:
     facts, _ = export_splat(path, tmp_path / "s.ply", each=True)
     written = {tmp_path / f"s-{number(name)}.ply" for name, state in STATES.items() if state != "removed"}
     assert {Path(file) for file in facts["splat"]} == written == set(tmp_path.glob("s*.ply"))
+    assert export_splat(path, tmp_path / "s.ply", each=True)[0] == facts
+    own = min(written)
+    for content in (b"ply\n", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n"):
+        own.write_bytes(content)  # not of an export: as good as any name that the user did not give
+        with pytest.raises(InputError, match=f"{own.name}: lies there, and is of no such export"):
+            export_splat(path, tmp_path / "s.ply", each=True)
+        assert own.read_bytes() == content
     with pytest.raises(InputError, match=f"no Gaussians of an instance {number('mug')}"):
         export_splat(path, tmp_path / "s.ply", only=[number("mug")])
 
