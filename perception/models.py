@@ -137,7 +137,7 @@ def get_model(name: str, progress: Progress = QUIET) -> StoredModel:
     if known is None or not _holds(known, entry):
         parts = models_folder() / ".parts" / name
         known = _install(name, [_fetched(entry, path, parts) for path in entry.files])
-        shutil.rmtree(parts)
+        shutil.rmtree(parts, ignore_errors=True)  # another process may have fetched it, too
     return known
 
 

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from perception import models
 from perception.cli import main
 from perception.errors import InputError
 from perception.masks import make_source
 from perception.models import add_model, check_file, get_model
-from perception.onnx.store import Entry, catalogue, find_model, models_folder
+from perception.onnx.store import Entry, StoredModel, catalogue, find_model, models_folder
 from support.onnx_files import FLOAT, INT64, SAM_DECODER, write_onnx
 
 IMAGE = ((1, 3, 1024, 1024), FLOAT)
@@ -181,6 +183,21 @@ def test_get_goes_on_after_a_broken_connection(
     assert 0 < int(resumed.removeprefix("bytes=").rstrip("-")) < encoder["bytes"]
     assert (encoder["bytes"], encoder["sha256"]) == hub["onnx/a.encoder.onnx"]
     assert not list((models_folder() / ".parts").iterdir())
+
+
+def test_get_beside_another_process_that_gets_the_same(
+    hub: dict[str, tuple[int, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It throws away what both have fetched."""
+
+    def installed(name: str, files: Sequence[tuple[str, Path, str]]) -> StoredModel:
+        model = install(name, files)
+        shutil.rmtree(models_folder() / ".parts" / name)
+        return model
+
+    install = models._install
+    monkeypatch.setattr(models, "_install", installed)
+    assert get_model("tiny").name == "tiny"
 
 
 @pytest.mark.parametrize(
