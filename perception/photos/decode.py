@@ -84,12 +84,12 @@ def exif_of(image: Image.Image, path: Path, folder: int | None = None) -> Mutabl
 
 
 def _without_pixels(path: Path) -> Image.Image:
-    """A PNG of the same chunks but those of pixels: EXIF data may lie behind them, for which Pillow decodes them."""
+    """A PNG of the chunks that may hold EXIF data: they may lie behind the pixels, and Pillow decodes all before."""
     with path.open("rb") as file:
         kept = [file.read(8)]
         while len(head := file.read(8)) == 8:
             length, kind = struct.unpack(">I4s", head)
-            if kind in (b"IDAT", b"fdAT"):
+            if kind not in (b"IHDR", b"eXIf", b"iTXt", b"tEXt", b"zTXt"):
                 file.seek(length + 4, os.SEEK_CUR)
             elif len(body := file.read(length + 4)) == length + 4:
                 kept += [head, body]

@@ -134,6 +134,8 @@ def test_the_exif_of_a_png_is_found_behind_its_pixels_without_them(tmp_path: Pat
     file.write_bytes(content[:at] + content[pixels:end] + chunk + content[end:])
     assert photo_size(file) == read_photo(file).shape[1::-1] == (60, 80)
     assert photo_size(file, as_stored=True) == read_photo(file, as_stored=True).shape[1::-1] == (80, 60)
+    picture.save(file, "PNG", exif=exif, save_all=True, append_images=[picture.rotate(180)])  # an animation
+    assert photo_size(file) == read_photo(file).shape[1::-1] == (60, 80)
     file.write_bytes(content[: pixels + 1000])
     assert photo_size(file) == (60, 80)
     refused(read_photo, file, match="damaged or cut short")
