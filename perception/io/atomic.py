@@ -14,11 +14,11 @@ import ctypes
 import errno
 import fcntl  # not filelock, which leaves lock files behind, cannot lock folders and does not name the holder
 import os
+import re
 import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from glob import escape
 from pathlib import Path
 from typing import Any, BinaryIO
 from uuid import uuid4
@@ -28,6 +28,7 @@ from perception.errors import InputError
 _FULL = {errno.ENOSPC, errno.EDQUOT}
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # from Linux fcntl.h and fs.h
 RETRY, TRIES = 0.001, 10_000  # seconds between two tries to lock what is written, and their number
+_TEMPORARY = re.compile(r"(new|old)-\d.*-.{8}")
 _TAKEN = {errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR}
 
 Discard = Callable[[Path, Path], None]
@@ -169,11 +170,12 @@ def _locked(path: Path, make: Callable[[], None]) -> Iterator[None]:
 
 def _leftovers(path: Path) -> list[tuple[str, Path]]:
     """("new" or "old", location) of all temporary siblings of `path`, oldest first."""
-    found = []
-    for kind in ("new", "old"):
-        for item in path.parent.glob(f".{escape(path.name)}.{kind}-[0-9]*-????????"):
-            with contextlib.suppress(OSError):  # an active writer has just renamed it
-                found.append((item.lstat().st_mtime_ns, kind, item))
+    own, found = f".{path.name}.", []
+    with contextlib.suppress(OSError):  # no folder, or not readable
+        for name in os.listdir(path.parent):  # noqa: PTH208 - a third of the time that glob takes among many files
+            if name.startswith(own) and (kind := _TEMPORARY.fullmatch(name, len(own))):
+                with contextlib.suppress(OSError):  # an active writer has just renamed it
+                    found.append(((path.parent / name).lstat().st_mtime_ns, kind[1], path.parent / name))
     return [(kind, item) for _, kind, item in sorted(found)]
 
 
