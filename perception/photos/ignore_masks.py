@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -21,11 +22,17 @@ from perception.types import Scene, View
 
 def mask_of(folder: Path | None, name: str) -> Path | None:
     """The mask of photo `name` in `folder`: "a/1.png" or "a/1.jpg.png" for "a/1.jpg"; None without one."""
-    if folder is None:
+    if folder is None or not folder.is_dir():
         return None
     names = (str(Path(name).with_suffix(".png")), f"{name}.png")
     exact = next((folder / name for name in names if (folder / name).is_file()), None)
-    return exact or next(filter(None, map(NamedFiles(folder).find, names)), None)
+    return exact or next(filter(None, map(_files_in(folder, folder.stat().st_mtime_ns).find, names)), None)
+
+
+@lru_cache(maxsize=4)
+def _files_in(folder: Path, changed: int) -> NamedFiles:
+    """The files of a folder that was `changed` then: listed once, not for each photo without a mask."""
+    return NamedFiles(folder)
 
 
 def read_mask(path: Path, width: int, height: int) -> np.ndarray:
