@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field, replace
+from heapq import heappop, heappush
 from pathlib import Path
 
 import cv2
@@ -65,10 +66,9 @@ def list_photos(folder: Path, suffixes: frozenset[str] = SUFFIXES) -> list[Path]
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "no such folder"
         raise InputError(f"{folder}: {what}; expected a folder of photos")
-    found, seen, waiting = [], set(), [folder]
-    while waiting:  # links last, so that a folder is listed under its own path
-        waiting.sort(key=lambda path: (path.is_symlink(), path))
-        here = waiting.pop(0)
+    found, seen, waiting, links = [], set(), [folder], list[Path]()
+    while waiting or links:  # links last, so that a folder is listed under its own path
+        here = heappop(waiting or links)
         identity = (here.stat().st_dev, here.stat().st_ino)
         if identity in seen:
             continue
@@ -80,7 +80,7 @@ def list_photos(folder: Path, suffixes: frozenset[str] = SUFFIXES) -> list[Path]
         for path in (path for path in inside if not path.name.startswith(".")):
             if path.is_dir():
                 if ".gsmap" not in path.name and not (path / FRAMES_RECORD).is_file():
-                    waiting.append(path)
+                    heappush(links if path.is_symlink() else waiting, path)
             elif path.suffix.lower() in suffixes and path.is_file():
                 found.append(path.relative_to(folder))
     return [folder / path for path in sorted(found)]
