@@ -56,6 +56,17 @@ def test_a_photo_whose_only_match_is_beyond_a_cut_is_divided_as_well() -> None:
     assert max(map(len, parts)) <= 20 and sorted(image for part in parts for image in part) == list(range(180))
 
 
+def test_a_long_walk_is_divided_into_runs() -> None:
+    """The least eigenvalues of a path differ by little: found as the largest of the matrix itself, 4,000 photos took a
+    minute, and the time grew with their number to the third power."""
+    count, rng = 3000, np.random.default_rng(0)
+    ahead = [(i, i + step) for step in range(1, 12) for i in range(1, count + 1 - step)]
+    matches = {(i, j): int(rng.integers(150, 250)) // (j - i) for i, j in ahead}
+    parts = partition.divide(matches, 100)
+    assert sum(parts, []) == list(range(1, count + 1))
+    assert max(map(len, parts)) <= 100 and min(map(len, parts)) >= 25
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_the_cut_is_the_least_along_the_eigenvector(seed: int) -> None:
     """The dense eigenvector of the generalised problem and all cuts along it, by their definition."""
