@@ -41,8 +41,8 @@ def needed_bytes(photos: PhotoSizes, max_side: int, budget: int, memory: int = 1
 
 
 def largest_budget(limit: int | None) -> int | None:
-    """Gaussians that fit into half of the `limit` of the process in bytes, beside the program."""
-    return None if limit is None else max(0, limit // 2 - BASE_BYTES) // BYTES_PER_GAUSSIAN
+    """Gaussians that fit into half of what the `limit` of the process in bytes leaves beside the program."""
+    return None if limit is None else max(0, limit - BASE_BYTES) // 2 // BYTES_PER_GAUSSIAN
 
 
 def log_estimate(source: Path, config: MapConfig, log: Callable[[str], None]) -> None:

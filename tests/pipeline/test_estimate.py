@@ -10,9 +10,10 @@ from PIL import Image
 
 from perception.config import load_config
 from perception.errors import InputError
+from perception.gaussians.state import sized
 from perception.inputs.load import PhotoSizes, photo_sizes
 from perception.pipeline import estimate as module
-from perception.pipeline.estimate import check_memory, check_size, log_estimate, needed_bytes
+from perception.pipeline.estimate import check_memory, check_size, largest_budget, log_estimate, needed_bytes
 from support.given_poses import SIZE, transforms
 
 GIB = 2**30
@@ -47,6 +48,15 @@ def test_a_run_that_cannot_fit_says_what_to_change() -> None:
     check_memory(photos, load_config(None, words + changed), 6 * GIB)
     with pytest.raises(InputError, match="fewer or smaller photos"):
         check_memory(photos, load_config(None, words), GIB // 2)
+
+
+@pytest.mark.parametrize("gib", [1.3, 1.5, 1.7, 2, 4])
+def test_a_small_machine_gives_a_map_its_gaussians(gib: float) -> None:
+    """Half of 1.7 GiB is the program alone: a map had 100 Gaussians there, and nobody was told."""
+    limit = int(gib * GIB)
+    budget = sized(load_config(None, []), 43, largest_budget(limit)).train.budget
+    assert 50_000 <= budget <= 100_000
+    assert check_memory(PhotoSizes([(480, 640)] * 43, ""), load_config(None, []), limit) <= limit
 
 
 def test_the_line_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
