@@ -51,7 +51,7 @@ def start_on_surface(
     points [P, 3], colors [P, 3] uint8: sparse points. None when no depth was measured. At most SHARE of the budget is
     used.
     """
-    most = max(1, int(SHARE * budget))
+    most = max(8, int(SHARE * budget))  # the voxels that meet at the origin are eight, whatever their side
     cloud = fuse_depth(views, most)
     if cloud is None:
         return None

@@ -77,6 +77,15 @@ def test_the_budget_limits_the_cloud():
     assert 200 <= len(coarse.points) <= 300 < len(fine.points)
 
 
+def test_a_budget_of_less_than_the_voxels_around_the_origin_ends() -> None:
+    """Voxels grew without end: those that meet at the origin are eight, whatever their side."""
+    raised = torch.eye(4)
+    raised[2, 3] = 0.3  # the origin in the middle of the box
+    views = [replace(view, camera_from_world=view.camera_from_world @ raised) for view in ring()]
+    start = start_on_surface(views, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), 1, 2, 0)
+    assert start is not None and 1 < len(start) <= 8
+
+
 def test_points_that_other_views_look_through_are_dropped():
     views = ring()
     ghost = views[0].depth.clone()
