@@ -85,7 +85,6 @@ def _ties(
     parts: Sequence[Poses], own: Sequence[set[int]], now: list[np.ndarray], near: float, seed: int
 ) -> Iterator[_Tie]:
     """Of all pairs of parts that share photos; now [n, 3, 3]: the points of each part, as it is placed."""
-    ransac = load_pycolmap().RANSACOptions(max_error=near, min_inlier_ratio=0.1, max_num_trials=5000, random_seed=seed)
     rows, having = [{image: n for n, image in enumerate(part)} for part in parts], dict[int, list[int]]()
     for number, part in enumerate(parts):
         for image in part:
@@ -94,13 +93,20 @@ def _ties(
     for a, b in sorted(pair for pair in pairs if pair[0] != pair[1]):
         shared = [image for image in sorted((own[a] | own[b]) & rows[a].keys()) if image in rows[b]]
         at = np.array([rows[a][image] for image in shared]), np.array([rows[b][image] for image in shared])
-        load_pycolmap().set_random_seed(seed)
-        found = load_pycolmap().estimate_sim3d_robust(
-            now[b][at[1]].reshape(-1, 3), now[a][at[0]].reshape(-1, 3), ransac
-        )
+        found = robust_similarity(now[b][at[1]].reshape(-1, 3), now[a][at[0]].reshape(-1, 3), near, seed)
         fits = np.zeros(3 * len(shared), bool) if found is None else np.asarray(found["inlier_mask"], bool)
         if fits.sum() >= max(FIT[0], FIT[1] * len(fits)):
             yield _Tie((a, b), at, fits.reshape(-1, 3))
+
+
+def robust_similarity(source: np.ndarray, target: np.ndarray, near: float, seed: int) -> dict[str, Any] | None:
+    """What pycolmap finds by RANSAC: "tgt_from_src", and which points [M, 3] it brings `near` (RANSAC's largest error)
+    to their targets, "inlier_mask" and "num_inliers"; None without a similarity."""
+    pycolmap = load_pycolmap()
+    pycolmap.set_random_seed(seed)
+    ransac = pycolmap.RANSACOptions(max_error=near, min_inlier_ratio=0.1, max_num_trials=5000, random_seed=seed)
+    found: dict[str, Any] | None = pycolmap.estimate_sim3d_robust(source, target, ransac)
+    return found
 
 
 def _step(moves: list[Similarity], now: list[np.ndarray], ties: list[_Tie], width: float) -> list[Similarity]:

@@ -76,12 +76,11 @@ class Candidate:
 
 @dataclass
 class Escalation:
-    """best: the candidate so far. groups: the photos of each camera (see `features`). fixed: intrinsics are kept.
-    more: THOROUGH features. known: models of these. rival: the best, with the points of `more`."""
+    """best: the candidate so far. groups: the photos of each camera (see `features`). more: THOROUGH features. known:
+    models of these. rival: the best, with the points of `more`."""
 
     best: Candidate
     groups: list[Group]
-    fixed: bool
     options: ReadOptions
     more: FeatureStore | None = None
     known: list[Any] = field(default_factory=list)
@@ -159,9 +158,8 @@ class Escalation:
         return max(grown, key=lambda each: len(each.registered))
 
     def _anew(self, store: FeatureStore) -> Candidate | None:
-        found = []
-        seed, progress = self.options.seed, self.options.progress
-        for models, out in incremental.candidates(store, self.fixed, seed, progress, most=CANDIDATES):
+        found: list[Candidate] = []
+        for models, out in incremental.candidates(store, self._pipeline(store), self.options.progress, CANDIDATES):
             whole = load_pycolmap().Reconstruction(models[0])
             found.append(self._checked(models, out, store))
             if len(found[-1].registered) >= whole.num_reg_images() and not found[-1].folded:
@@ -247,10 +245,13 @@ class Escalation:
 
     # ----------------------------------------------------------------- models
 
+    def _pipeline(self, store: FeatureStore) -> Any:
+        """The options of pycolmap for the features of the store."""
+        return pipeline_options(self.options.lens is not None, self.options.seed, True, store.effort)
+
     def _adjusted(self, models: list[Any], store: FeatureStore) -> Any:
         """One model of aligned ones, adjusted to all matches of the store."""
-        options = pipeline_options(self.fixed, self.options.seed, one_thread=True, effort=store.effort)
-        return merge.adjusted(merge.merged(models), store, options, add=False)
+        return merge.adjusted(merge.merged(models), store, self._pipeline(store), add=False)
 
     def _grown(self, start: Any, store: FeatureStore, again: bool = True, joined: bool = False) -> Candidate:
         """`start` with photos added, checked."""
@@ -258,8 +259,7 @@ class Escalation:
 
     def _mapped(self, start: Any, store: FeatureStore) -> incremental.Mapped:
         """`start` with photos added."""
-        seed, count, progress = self.options.seed, len(store.names), self.options.progress
-        return map_photos(store, self.fixed, seed, count, progress, one_thread=True, start=start)
+        return map_photos(store, self._pipeline(store), len(store.names), self.options.progress, start)
 
     def _checked(
         self, models: list[Any], contradicted: set[str], store: FeatureStore, again: bool = True, joined: bool = False

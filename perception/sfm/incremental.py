@@ -43,29 +43,18 @@ def pipeline_options(fixed: bool, seed: int, one_thread: bool, effort: Effort = 
     return options
 
 
-def map_photos(
-    store: FeatureStore,
-    fixed: bool,
-    seed: int,
-    count: int,
-    progress: Progress,
-    one_thread: bool = False,
-    start: Any | None = None,
-) -> Mapped:
+def map_photos(store: FeatureStore, options: Any, count: int, progress: Progress, start: Any | None = None) -> Mapped:
     """All models, largest first (pycolmap does not sort them), and names of photos left out as contradicted.
-    fixed: the intrinsics in the database are not refined. one_thread: also for more than REPEATABLE_PHOTOS photos.
-    start: a model of the store's features, to which photos are added."""
+    options: of `pipeline_options`. start: a model of the store's features, to which photos are added."""
     with TemporaryDirectory(dir=store.folder) as folder:
-        one_thread = one_thread or count <= REPEATABLE_PHOTOS
-        mapping = _Mapping(store, Path(folder), fixed, seed, count, progress, one_thread)
+        mapping = _Mapping(store, options, Path(folder), count, progress)
         return mapping.run() if start is None else mapping.extended(start)
 
 
-def candidates(store: FeatureStore, fixed: bool, seed: int, progress: Progress, most: int) -> Iterator[Mapped]:
-    """As `map_photos`, of one thread, but all that it chooses from, at most `most`."""
+def candidates(store: FeatureStore, options: Any, progress: Progress, most: int) -> Iterator[Mapped]:
+    """As `map_photos`, but all that it chooses from, at most `most`."""
     with TemporaryDirectory(dir=store.folder) as folder:
-        mapping = _Mapping(store, Path(folder), fixed, seed, len(store.names), progress, one_thread=True)
-        yield from islice(mapping.candidates(), most)
+        yield from islice(_Mapping(store, options, Path(folder), len(store.names), progress).candidates(), most)
 
 
 @dataclass
@@ -73,12 +62,10 @@ class _Mapping:
     """Computes models from subsets of the verified pairs and selects the best."""
 
     store: FeatureStore
+    options: Any
     folder: Path
-    fixed: bool
-    seed: int
     count: int
     progress: Progress
-    one_thread: bool
     shown: float = 0.0
     runs: int = 0
 
@@ -136,10 +123,8 @@ class _Mapping:
         return [best, *models[1:]], {name_of[image] for image in still | (wrong - registered)}
 
     def _map(self, database: Path, min_inliers: int, start: Any | None = None) -> list[Any]:
-        pycolmap = load_pycolmap()
-        options = pipeline_options(self.fixed, self.seed, self.one_thread, self.store.effort)
-        options.min_num_matches = min_inliers
-        options.multiple_models = start is None
+        self.options.min_num_matches = min_inliers
+        self.options.multiple_models = start is None
         self.runs += 1
         source = self.folder / f"start-{self.runs}"
         if start is not None:
@@ -155,13 +140,9 @@ class _Mapping:
             self.shown = max(self.shown, min(1.0, registered / self.count))
             self.progress.update("poses: mapping", round(100 * self.shown), 100)
 
-        found = pycolmap.incremental_mapping(
-            database,
-            self.store.image_root,
-            out,
-            options,
-            input_path=source if start is not None else "",
-            next_image_callback=next_image,
+        paths, begun = (database, self.store.image_root, out), source if start is not None else ""
+        found = load_pycolmap().incremental_mapping(
+            *paths, self.options, input_path=begun, next_image_callback=next_image
         )
         models = [model for model in found.values() if model.num_reg_images() >= MIN_MODEL_SIZE]
         return sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))

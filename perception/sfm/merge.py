@@ -12,6 +12,7 @@ import networkx as nx
 import numpy as np
 
 from perception.photos.lens import load_pycolmap
+from perception.sfm.alignment import robust_similarity
 from perception.sfm.database import FeatureStore
 from perception.sfm.incremental import MIN_MODEL_SIZE, take_out
 from perception.sfm.partition import OVERLAP
@@ -84,7 +85,7 @@ def part_of(model: Any, photos: set[int]) -> Any:
 def align_by_matches(main: Any, other: Any, matches: Matches, seed: int) -> bool:
     """Moves `other` so that most of its matched points lie on those of `main`; False where few do.
     matches: verified ones [M, 2] of pairs of image ids. Points are of tracks, so one match of two tracks is enough."""
-    pycolmap, linked = load_pycolmap(), dict[tuple[int, int], None]()
+    linked = dict[tuple[int, int], None]()
     for pair, found in matches.items():
         for side in (0, 1):
             if pair[side] in main.reg_image_ids() and pair[1 - side] in other.reg_image_ids():
@@ -96,12 +97,10 @@ def align_by_matches(main: Any, other: Any, matches: Matches, seed: int) -> bool
     here = np.array([main.points3D[a].xyz for a, _ in linked])
     there = np.array([other.points3D[b].xyz for _, b in linked])
     near = NEAR * float(np.median(np.linalg.norm(here - np.median(here, axis=0), axis=1)))
-    pycolmap.set_random_seed(seed)
-    ransac = pycolmap.RANSACOptions(max_error=near, min_inlier_ratio=0.1, max_num_trials=5000, random_seed=seed)
-    found = pycolmap.estimate_sim3d_robust(there, here, ransac)
-    if found is None or found["num_inliers"] < MATCHED:
+    similarity = robust_similarity(there, here, near, seed)
+    if similarity is None or similarity["num_inliers"] < MATCHED:
         return False
-    other.transform(found["tgt_from_src"])
+    other.transform(similarity["tgt_from_src"])
     return True
 
 

@@ -47,8 +47,8 @@ def _upper_half(weights: sparse.csr_matrix) -> np.ndarray:
     degree = np.maximum(np.asarray(weights.sum(axis=1)).ravel(), 1)  # a photo whose matches a cut took has none
     scaled = sparse.diags(degree**-0.5)
     start = np.random.default_rng(0).normal(size=count)  # ARPACK's own is random
-    # The two least eigenvalues of the Laplacian. Along a walk they differ by little, so they are found as the largest of
-    # its inverse: of the matrix itself, that of 4,000 photos took a minute.
+    # The Laplacian's two least eigenvalues, near each other along a walk, as the largest of its inverse: by the matrix
+    # itself, 4,000 photos took a minute.
     laplacian = (sparse.identity(count) - scaled @ weights @ scaled).tocsc()
     values, vectors = eigsh(laplacian, k=2, sigma=-1e-6, v0=start)
     vector = vectors[:, values.argmax()] * degree**-0.5

@@ -27,7 +27,7 @@ from perception.sfm.consistency import model_warnings
 from perception.sfm.database import FeatureStore, build_features, verified_matches
 from perception.sfm.escalation import MORE, Candidate, Escalation
 from perception.sfm.features import FEW_FEATURES, camera_groups
-from perception.sfm.incremental import REPEATABLE_PHOTOS, map_photos, read_models, write_models
+from perception.sfm.incremental import REPEATABLE_PHOTOS, map_photos, pipeline_options, read_models, write_models
 from perception.sfm.model import cloud_of, views_of_model
 from perception.sfm.options import ReadOptions
 from perception.sfm.submodels import map_submodels
@@ -81,15 +81,15 @@ def _too_few(folder: Path, chosen: PhotoSet) -> InputError:
 
 def _map(store: FeatureStore, chosen: PhotoSet, folder: Path, options: ReadOptions) -> tuple[Any, dict[str, Any]]:
     """The largest model, kept in the store's folder, and its report."""
-    done, fixed = store.folder / "model", options.lens is not None
+    done = store.folder / "model"
     recover(done)
     if not done.is_dir():
         started, count = time.perf_counter(), len(chosen.photos)
-        best, steps = _at_once(store, fixed, options), list[dict[str, Any]]()
+        best, steps = _at_once(store, options), list[dict[str, Any]]()
         seconds = {**store.facts["seconds"], "mapping": time.perf_counter() - started}
         if len(best.registered) < count:
             groups = camera_groups(store.image_root, chosen.photos, store.names, [options.lens] * count)
-            best, steps = Escalation(best, groups, fixed, options).run()
+            best, steps = Escalation(best, groups, options).run()
         if not best.models or not best.models[0].num_points3D():  # all of a plane's may be filtered out
             advice = "take sharp, overlapping photos of a textured scene from different positions"
             found = f"{len(best.registered) or 'none'} of the {count} photos could be registered"
@@ -99,18 +99,20 @@ def _map(store: FeatureStore, chosen: PhotoSet, folder: Path, options: ReadOptio
         with atomic_directory(done) as new:
             best.models[0].write(new)
             (new / "report.json").write_text(json.dumps(report))
-    for folder in (store.folder / AT_ONCE, store.folder / MORE):
-        shutil.rmtree(folder, ignore_errors=True)
+    for name in (AT_ONCE, MORE):
+        shutil.rmtree(store.folder / name, ignore_errors=True)
     return load_pycolmap().Reconstruction(done), json.loads((done / "report.json").read_text())
 
 
-def _at_once(store: FeatureStore, fixed: bool, options: ReadOptions) -> Candidate:
+def _at_once(store: FeatureStore, options: ReadOptions) -> Candidate:
     """The models by the features and pairs of the store. Where they lack photos, they are kept for a later call."""
     folder, count = store.folder / AT_ONCE, len(store.names)
     recover(folder)
     if not folder.is_dir():
-        found = map_submodels(store, fixed, options) if count > REPEATABLE_PHOTOS else None
-        models, contradicted = found or map_photos(store, fixed, options.seed, count, options.progress)
+        few = count <= REPEATABLE_PHOTOS
+        found = None if few else map_submodels(store, options)
+        pipeline = pipeline_options(options.lens is not None, options.seed, few)
+        models, contradicted = found or map_photos(store, pipeline, count, options.progress)
         if models and models[0].num_reg_images() == count:
             return Candidate(models, contradicted, store)
         with atomic_directory(folder) as new:

@@ -22,12 +22,12 @@ from perception.sfm.options import ReadOptions
 from perception.tasks.folder import RESULT, has_task, read_facts, run_tasks, write_task
 
 
-def map_submodels(store: FeatureStore, fixed: bool, options: ReadOptions) -> incremental.Mapped | None:
+def map_submodels(store: FeatureStore, options: ReadOptions) -> incremental.Mapped | None:
     """As `map_photos`, by submodels; None where the photos' matches contradict the merged model."""
     counts = {pair: len(matches) for pair, matches in verified_matches(store.database).items() if len(matches)}
     if not counts:
         return None
-    seed, progress = options.seed, options.progress
+    fixed, seed, progress = options.lens is not None, options.seed, options.progress
     divided = partition.divide(counts, partition.LARGEST)
     submodels = partition.with_overlap(divided, counts)
     folders = [_task(store, images, number, fixed, seed) for number, images in enumerate(submodels)]
@@ -72,6 +72,6 @@ def submodel_task(task: str, progress: Progress = QUIET) -> None:
     if (folder / RESULT).is_dir():
         return
     store = FeatureStore(folder, Path(facts["photos"]), [], {})
-    models, _ = map_photos(store, facts["fixed"], facts["seed"], facts["count"], progress, one_thread=True)
+    models, _ = map_photos(store, pipeline_options(facts["fixed"], facts["seed"], True), facts["count"], progress)
     with atomic_directory(folder / RESULT) as new:
         incremental.write_models(models, new)

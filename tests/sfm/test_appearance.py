@@ -19,6 +19,7 @@ from perception.sfm.database import FeatureStore, delete_pairs, verified_matches
 from perception.sfm.escalation import Candidate, Escalation
 from perception.sfm.features import THOROUGH
 from perception.sfm.options import ReadOptions
+from perception.types import Lens
 from support.aimed import look_at
 
 WIDTH, HEIGHT, FOCAL, PHOTOS, HALF = 320, 240, 200.0, 12, 2.0
@@ -122,7 +123,8 @@ class Room:
 @pytest.fixture
 def room(tmp_path: Path) -> tuple[Room, Escalation]:
     room = Room(tmp_path / "room")
-    return room, Escalation(Candidate([], set(), room.store), [], True, ReadOptions(tmp_path))
+    lens = Lens("PINHOLE", (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2), WIDTH, HEIGHT)
+    return room, Escalation(Candidate([], set(), room.store), [], ReadOptions(tmp_path, lens=lens))
 
 
 def test_photos_are_moved_to_the_side_where_they_look_alike(room: tuple[Room, Escalation]) -> None:

@@ -18,7 +18,7 @@ from perception.sfm.consistency import Pair, consistent_photos, stronger_contrad
 from perception.sfm.database import FeatureStore
 from perception.sfm.escalation import MORE, Candidate, Escalation, _loose
 from perception.sfm.features import QUICK, THOROUGH, Effort
-from perception.sfm.incremental import map_photos
+from perception.sfm.incremental import map_photos, pipeline_options
 from perception.sfm.options import ReadOptions
 from support.aimed import look_at
 from support.progress import Told
@@ -98,8 +98,8 @@ def escalated(
     early = room.store(folder / "early", QUICK, lambda i, j: not {i, j} & LATE and j - i < 5)
     more = room.store(folder / "early" / MORE, THOROUGH, linked, alike)
     monkeypatch.setattr(Escalation, "_more_features", lambda self: more)
-    first = Candidate(*map_photos(early, False, 0, PHOTOS, told), early)
-    best, steps = Escalation(first, [], False, ReadOptions(folder, progress=told)).run()
+    first = Candidate(*map_photos(early, pipeline_options(False, 0, True), PHOTOS, told), early)
+    best, steps = Escalation(first, [], ReadOptions(folder, progress=told)).run()
     return first, best, steps, told
 
 
@@ -150,7 +150,7 @@ def test_photos_without_features_cost_nothing(tmp_path: Path, monkeypatch: pytes
     store = room.store(tmp_path / "early", QUICK, lambda i, j: False)
     more = room.store(tmp_path / "early" / MORE, THOROUGH, lambda i, j: False)
     monkeypatch.setattr(Escalation, "_more_features", lambda self: asked.append(self._left_out()) or more)
-    _, steps = Escalation(Candidate([], set(), store), [], False, ReadOptions(tmp_path, progress=Told())).run()
+    _, steps = Escalation(Candidate([], set(), store), [], ReadOptions(tmp_path, progress=Told())).run()
     assert asked == [list(range(blank, PHOTOS))] * (blank < PHOTOS)
     assert [step["step"] for step in steps] == ["at once", "more features"][: 1 + len(asked)]
 
@@ -163,7 +163,7 @@ def test_a_scene_is_mapped_anew_where_nothing_is_registered_at_once(
     more = room.store(tmp_path / MORE, THOROUGH, lambda i, j: j - i < 5)
     monkeypatch.setattr(Escalation, "_more_features", lambda self: more)
     none = Candidate([], set(), FeatureStore(more.folder, more.image_root, more.names, {}))
-    best, steps = Escalation(none, [], False, ReadOptions(tmp_path, progress=Told())).run()
+    best, steps = Escalation(none, [], ReadOptions(tmp_path, progress=Told())).run()
     assert [step["step"] for step in steps] == ["at once", "more features", "mapping anew"]
     assert len(best.registered) == PHOTOS and room.wrong(best) == 0
 

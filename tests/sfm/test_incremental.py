@@ -35,6 +35,6 @@ def test_a_photo_that_no_later_model_lists_is_named(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(incremental._Mapping, "_map", map_again)
     monkeypatch.setattr(incremental._Mapping, "_database_without", lambda *_: tmp_path)
     store = FeatureStore(tmp_path, tmp_path, [], {})
-    mapping = incremental._Mapping(store, tmp_path, True, 0, 8, QUIET, True)
+    mapping = incremental._Mapping(store, incremental.pipeline_options(True, 0, True), tmp_path, 8, QUIET)
     (best,), left_out = mapping._without_outvoted([model])
     assert left_out == {name} and outvoted not in best.images

@@ -63,7 +63,7 @@ def test_a_long_walk_is_divided_into_runs() -> None:
     ahead = [(i, i + step) for step in range(1, 12) for i in range(1, count + 1 - step)]
     matches = {(i, j): int(rng.integers(150, 250)) // (j - i) for i, j in ahead}
     parts = partition.divide(matches, 100)
-    assert sum(parts, []) == list(range(1, count + 1))
+    assert [image for part in parts for image in part] == list(range(1, count + 1))
     assert max(map(len, parts)) <= 100 and min(map(len, parts)) >= 25
 
 
@@ -112,9 +112,10 @@ def test_a_walk_in_submodels_is_the_true_one_and_always_the_same(
         store, truth = walk(tmp_path / str(number), np.random.default_rng(0))
         monkeypatch.setattr(engines, "cores", lambda cores=cores: cores)
         told = Told()
-        models, left_out = submodels.map_submodels(
-            store, False, ReadOptions(tmp_path, progress=told, engine=engine)
-        ) or ([], set())
+        models, left_out = submodels.map_submodels(store, ReadOptions(tmp_path, progress=told, engine=engine)) or (
+            [],
+            set(),
+        )
         assert len(models) == 1 and not left_out
         found.append(poses(models[0]))
         if cores > 1:
@@ -139,7 +140,7 @@ def test_photos_without_a_submodel_are_added_and_small_repeated_models_are_not_u
     monkeypatch.setattr(partition, "divide", lambda *given: [[i for i in part if i != 7] for part in divide(*given)])
     monkeypatch.setattr(partition, "with_overlap", lambda divided, _: [divided[0] + divided[1][:5], *divided[1:]])
     store, _ = walk(tmp_path / "walk", np.random.default_rng(0))
-    ((whole, *_), _) = submodels.map_submodels(store, False, ReadOptions(tmp_path)) or ([None], set())
+    ((whole, *_), _) = submodels.map_submodels(store, ReadOptions(tmp_path)) or ([None], set())
     assert whole is not None and whole.num_reg_images() == PHOTOS
     small = pycolmap.Reconstruction(whole)
     submodels.take_out(small, set(sorted(small.reg_image_ids())[10:]))
@@ -174,7 +175,7 @@ def test_a_contradicted_model_is_not_returned(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(submodels, "is_contradicted", lambda pairs: len(pairs) > 100)
     store, _ = walk(tmp_path / "walk", np.random.default_rng(0))
     told = Told()
-    assert submodels.map_submodels(store, False, ReadOptions(tmp_path, progress=told)) is None
+    assert submodels.map_submodels(store, ReadOptions(tmp_path, progress=told)) is None
     assert told.lines[-1].endswith("all photos are mapped in one piece")
 
 

@@ -24,13 +24,13 @@ from perception.geometry import align_similarity
 from perception.progress import Progress
 from perception.sfm import parts
 from perception.sfm.database import FeatureStore, build_features
-from perception.sfm.incremental import map_photos
+from perception.sfm.incremental import REPEATABLE_PHOTOS, map_photos, pipeline_options
 from perception.sfm.options import ReadOptions
 from perception.sfm.submodels import map_submodels
 
 
 def by_submodels(store: FeatureStore, count: int) -> Any:
-    found = map_submodels(store, False, ReadOptions(store.folder))
+    found = map_submodels(store, ReadOptions(store.folder))
     assert found is not None, "contradicted"
     return found[0][0]
 
@@ -41,7 +41,8 @@ def in_parts(store: FeatureStore, count: int) -> Any:
 
 
 def incremental(store: FeatureStore, count: int) -> Any:
-    models, _ = map_photos(store, False, 0, count, Progress(quiet=True))
+    few = count <= REPEATABLE_PHOTOS
+    models, _ = map_photos(store, pipeline_options(False, 0, few), count, Progress(quiet=True))
     return models[0]
 
 
