@@ -32,10 +32,10 @@ class SparseAdam:
     """
 
     def __init__(self, params: Mapping[str, Tensor]) -> None:
-        self.params = dict(params)
         self.steps = 0
-        self._first = {name: torch.zeros_like(t) for name, t in self.params.items()}
-        self._second = {name: torch.zeros_like(t) for name, t in self.params.items()}
+        self.params = dict(params)
+        self._first, self._second = ({name: torch.zeros_like(t) for name, t in params.items()} for _ in range(2))
+        self._tables = {"params": self.params, "first": self._first, "second": self._second}
 
     def step(self, rates: Mapping[str, Rate], grads: Mapping[str, Tensor | None], visible: Tensor | None = None) -> int:
         """One step of the rows where visible [N] uint8 is not 0; None: of all. grads: name -> [N, ...].
@@ -66,13 +66,13 @@ class SparseAdam:
     def keep(self, index: Tensor) -> None:
         """Keeps the rows `index` selects, in its order: [N] bool, or int64 row numbers (repeats allowed)."""
         rows = index.nonzero()[:, 0] if index.dtype == torch.bool else index
-        for table in (self.params, self._first, self._second):
+        for table in self._tables.values():
             for name, tensor in table.items():
                 table[name] = tensor.index_select(0, rows)
 
     def resize(self, name: str, count: int) -> None:
         """Cuts the rows of `name`, [N, K, ...], to K = count, or extends them by zeros, and their moments alike."""
-        for table in (self.params, self._first, self._second):
+        for table in self._tables.values():
             old = table[name]
             more = old.new_zeros(len(old), max(0, count - old.shape[1]), *old.shape[2:])
             table[name] = torch.cat([old[:, :count], more], dim=1)
@@ -80,24 +80,21 @@ class SparseAdam:
     def append(self, rows: Mapping[str, Tensor]) -> None:
         """Appends rows (name -> [M, ...], the same M for all) with zero moments."""
         for name, new in rows.items():
-            old = self.params[name]
-            new = new.to(old)
-            self.params[name] = torch.cat([old, new])
-            for table in (self._first, self._second):
-                table[name] = torch.cat([table[name], torch.zeros_like(new)])
+            for table in self._tables.values():
+                old = table[name]
+                table[name] = torch.cat([old, new.to(old) if table is self.params else old.new_zeros(new.shape)])
 
     def state_dict(self, copy: bool = True) -> dict[str, Any]:
         """Everything needed to continue: params and moments on the CPU, step count. Without `copy`, tensors that are on
         the CPU are returned themselves, and the next step changes them."""
-        tables = {"params": self.params, "first": self._first, "second": self._second}
         copies: dict[str, Any] = {
-            key: {name: t.to("cpu", copy=copy) for name, t in table.items()} for key, table in tables.items()
+            key: {name: t.to("cpu", copy=copy) for name, t in table.items()} for key, table in self._tables.items()
         }
         return copies | {"steps": self.steps}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores a `state_dict` of the same names; the number of rows may differ."""
-        for table, key in ((self.params, "params"), (self._first, "first"), (self._second, "second")):
+        for key, table in self._tables.items():
             for name, tensor in state[key].items():
                 table[name] = tensor.to(table[name].device, copy=True).contiguous()
         self.steps = state["steps"]

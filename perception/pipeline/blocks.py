@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -130,10 +129,14 @@ def _divided(
     ]
 
 
-def optimiser(scene: Scene, most: int) -> Callable[[Run, Scene, list[View], list[View], MaskSource], Optimised]:
-    """`optimise` for a scene that is trained in one piece, `optimise_blocks` for a larger one. most: see `cut`."""
-    blocks = cut(scene, most)
-    return optimise if len(blocks) == 1 else partial(optimise_blocks, blocks)
+def optimise_scene(
+    run: Run, scene: Scene, training: list[View], held_out: list[View], source: MaskSource
+) -> Optimised:
+    """Trains a scene in one piece, or in blocks where it has more than `train.block_photos`."""
+    blocks = cut(scene, run.config.train.block_photos)
+    if len(blocks) == 1:
+        return optimise(run, scene, training, held_out, source)
+    return optimise_blocks(blocks, run, scene, training, held_out, source)
 
 
 def optimise_blocks(

@@ -24,7 +24,7 @@ from perception.masks import MaskSource, make_source
 from perception.masks.compute import load_segmentation
 from perception.photos.scene_file import load_saved_scene, save_scene
 from perception.photos.view_json import stored_view
-from perception.pipeline.blocks import optimiser
+from perception.pipeline.blocks import optimise_scene
 from perception.pipeline.changes import finished, hold_inputs
 from perception.pipeline.checkpoint import check_name, fingerprint, frames_folder, poses_mark, working
 from perception.pipeline.estimate import log_estimate
@@ -79,7 +79,7 @@ def build_map(
 
         # Masks M_v,i of every photo (§3.2), and Gaussians optimised on photos and masks (§3.1 to 3.2.3).
         if splat is None:
-            optimised = optimiser(scene, config.train.block_photos)(run, scene, training, held_out, masks)
+            optimised = optimise_scene(run, scene, training, held_out, masks)
         else:  # Gaussians as they are, and features alone
             optimised = splat.optimise(run, training, held_out, masks)
         segments = load_segmentation(run.masks) if masks.needs_depth else None

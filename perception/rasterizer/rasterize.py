@@ -53,7 +53,7 @@ class Rasterization:
     stats: RasterizationStats
 
 
-_DEVICES = ("cpu", "cuda")
+_DEVICES, _SIDES = ("cpu", "cuda"), range(1, (1 << 20) + 1)
 
 
 def rasterizer_for(device: torch.device) -> ModuleType:
@@ -208,8 +208,8 @@ def _check(
             wanted = "float32 or float64" if t is means else means.dtype
             raise InputError(f"rasterize: {name} is {t.dtype}, expected {wanted}")
     _check_shapes(tensors, sh_degree)
-    if not (1 <= width <= 1 << 20 and 1 <= height <= 1 << 20):
-        raise InputError(f"rasterize: image size {width} × {height}, expected 1 to 1048576 pixels a side")
+    if width not in _SIDES or height not in _SIDES:
+        raise InputError(f"rasterize: image size {width} × {height}, expected 1 to {_SIDES[-1]} whole pixels a side")
     if not (near_plane >= 0 and near_plane < float("inf")):
         raise InputError(f"rasterize: near_plane is {near_plane}, expected a finite number ≥ 0")
     if not 0.01 <= eps2d <= 1e4:
@@ -221,7 +221,7 @@ def _check_shapes(tensors: dict[str, Any], sh_degree: int | None) -> None:
     colors = tensors["colors"]
     color_shape: tuple[int, ...] = (*n, 3)
     if sh_degree is not None:
-        if not 0 <= sh_degree <= 3:
+        if sh_degree not in range(4):
             raise InputError(f"rasterize: sh_degree is {sh_degree}, expected 0 to 3")
         k = colors.shape[1] if colors.ndim == 3 else 0
         color_shape = (*n, max(k, (sh_degree + 1) ** 2), 3)

@@ -203,6 +203,8 @@ def test_non_finite_input_is_named(name, value):
             r"background has shape \[5, 3\], expected \[2, 3\]",
         ),
         ({"width": 0}, r"image size 0"),
+        ({"width": 16.5}, r"image size 16.5"),
+        ({"sh_degree": 1.5}, r"sh_degree is 1.5, expected 0 to 3"),
         ({"sh_degree": 4}, r"sh_degree is 4, expected 0 to 3"),
         ({"near_plane": float("nan")}, r"near_plane is nan"),
         ({"eps2d": 0.0}, r"eps2d is 0.0, expected 0.01 to 10000 px²"),
