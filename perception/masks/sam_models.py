@@ -14,16 +14,7 @@ import numpy as np
 from PIL import Image
 
 from perception.errors import InputError
-from perception.onnx.sessions import (
-    dtype_of,
-    fingerprint,
-    model_graphs,
-    open_session,
-    provider_warning,
-    read_config,
-    shape_of,
-    signature,
-)
+from perception.onnx import sessions
 from perception.onnx.store import known_names, resolve
 
 # Role -> names of it in public exporters. Masks at low resolution come first: some exports fix the photo size that they
@@ -95,7 +86,7 @@ class Graph:
         import onnxruntime
 
         feeds: dict[str, np.ndarray] = {
-            x.name: values[role].astype(dtype_of(x), copy=False) for role, x in self.inputs.items()
+            x.name: values[role].astype(sessions.dtype_of(x), copy=False) for role, x in self.inputs.items()
         }
         options = onnxruntime.RunOptions()
         options.only_execute_path_to_fetches = True  # no masks at the photo's size when those at low resolution do
@@ -122,10 +113,10 @@ class SamModel:
         self.kind = decoder_family(decoder)
         self.family = self.kind.name
         _check_pair(encoder, decoder)
-        self.fingerprint = f"{fingerprint(encoder.path)}-{fingerprint(decoder.path)}"
+        self.fingerprint = f"{sessions.fingerprint(encoder.path)}-{sessions.fingerprint(decoder.path)}"
         self.provider = " + ".join(dict.fromkeys(g.session.get_providers()[0] for g in (encoder, decoder)))
-        self.warnings = list(filter(None, (provider_warning(g.path, g.session) for g in (encoder, decoder))))
-        config = read_config(encoder.path, "preprocessor_config.json")
+        self.warnings = list(filter(None, (sessions.provider_warning(g.path, g.session) for g in (encoder, decoder))))
+        config = sessions.read_config(encoder.path, "preprocessor_config.json")
         self._mean, self._std = (
             np.asarray(config[key], np.float32) * 255 if config.get(key) else np.asarray(usual, np.float32)
             for key, usual in (("image_mean", _MEAN), ("image_std", _STD))
@@ -149,9 +140,9 @@ class SamModel:
     def _probe(self) -> bool:
         """Whether two prompts of an empty embedding are answered in one call. Declared axes are not to be trusted.
         Warns of a decoder that gives one mask a prompt. InputError if the decoder does not run at all."""
-        shapes = {role: shape_of(x) for role, x in self.decoder.inputs.items() if role in self.encoder.outputs}
+        shapes = {role: sessions.shape_of(x) for role, x in self.decoder.inputs.items() if role in self.encoder.outputs}
         axis = 1 if self.kind.nested else 0
-        fixed = shape_of(self.decoder.inputs["points"])[axis]
+        fixed = sessions.shape_of(self.decoder.inputs["points"])[axis]
         if None in {size for shape in shapes.values() for size in shape[1:]}:
             return fixed is None
         tensors = {role: np.zeros([n or 1 for n in shape]) for role, shape in shapes.items()}
@@ -176,7 +167,7 @@ class SamModel:
 
     def _prepare(self, photo: np.ndarray) -> tuple[np.ndarray, tuple[int, int], tuple[int, int]]:
         """The encoder's input, the (h, w) that the photo covers in it, and the input's (h, w)."""
-        shape = shape_of(self.encoder.inputs["image"])
+        shape = sessions.shape_of(self.encoder.inputs["image"])
         if self.kind.fit == "own size":
             return photo.transpose(2, 0, 1)[None] / np.float32(255), photo.shape[:2], photo.shape[:2]
         raw = len(shape) == 3  # [h, w, 3] in 0–255, normalised by the graph
@@ -211,7 +202,7 @@ class SamModel:
         if self.kind.pads:
             scaled = np.concatenate([scaled, np.zeros_like(scaled)], axis=1)
             labels = np.concatenate([labels, -labels], axis=1)
-        shapes = {role: shape_of(x) for role, x in self.decoder.inputs.items()}
+        shapes = {role: sessions.shape_of(x) for role, x in self.decoder.inputs.items()}
         side = 4 * embedding.tensors["embedding"].shape[-1]
         prior = shapes.get("mask_input", [None, 1, None, None])
         # SAM's graph assumes that the long side fills the square. Encoders with a fixed non-square input differ.
@@ -250,7 +241,9 @@ def open_sam(spec: str, threads: int = 0) -> SamModel:
     encoders, decoders = [g for g in graphs if g.is_encoder], [g for g in graphs if g.is_decoder]
     if len(encoders) == 1 and len(decoders) == 1:
         return SamModel(encoders[0], decoders[0])
-    kinds = ("encoder" if g.is_encoder else "decoder" if g.is_decoder else signature(g.session) for g in graphs)
+    kinds = (
+        "encoder" if g.is_encoder else "decoder" if g.is_decoder else sessions.signature(g.session) for g in graphs
+    )
     roles = "; ".join(f"{g.path.name}: {kind}" for g, kind in zip(graphs, kinds, strict=True))
     what = f"expected one SAM encoder and its decoder, found {roles}"
     raise InputError(f"sam:{spec}: {what}; put both into one folder or write sam:ENCODER,DECODER")
@@ -258,7 +251,7 @@ def open_sam(spec: str, threads: int = 0) -> SamModel:
 
 def open_graph(path: Path, threads: int = 0) -> Graph:
     """Opens an ONNX file and assigns roles to its inputs and outputs."""
-    session = open_session(path, threads)
+    session = sessions.open_session(path, threads)
     inputs = {_ROLES.get(argument.name, argument.name): argument for argument in session.get_inputs()}
     return Graph(path, session, inputs, _outputs([argument.name for argument in session.get_outputs()]))
 
@@ -277,7 +270,7 @@ def _outputs(names: list[str]) -> dict[str, str]:
 def sam_graphs(path: Path) -> list[Path]:
     """The ONNX files of a folder, or a file and the partner beside it. InputError where there are none."""
     if path.is_dir():
-        return model_graphs(path)[0]
+        return sessions.model_graphs(path)[0]
     if not path.is_file():
         missing = "no such file or folder, nor a stored model; expected a SAM encoder and decoder as ONNX"
         raise InputError(f"sam:{path}: {missing}; {known_names()}")
@@ -291,7 +284,7 @@ def decoder_family(decoder: Graph) -> Family:
     """The family of a decoder, from the names of its inputs."""
     family = FAMILIES.get((decoder.inputs["points"].name, "high_res_0" in decoder.inputs))
     if family is None:
-        raise InputError(f"{decoder.path}: a decoder of no known family ({signature(decoder.session)})")
+        raise InputError(f"{decoder.path}: a decoder of no known family ({sessions.signature(decoder.session)})")
     return family
 
 

@@ -29,7 +29,7 @@ from perception.map.replace import writing
 from perception.masks import MaskSource, make_source
 from perception.pipeline.checkpoint import BEFORE_MASKS, CHECKPOINT, digest, load_checkpoint, save_checkpoint
 from perception.pipeline.estimate import largest_budget
-from perception.pipeline.optimise import Optimised, Photos, Run, label_by_tasks, label_photos, optimise
+from perception.pipeline.optimise import Optimised, Photos, Run, label_photos, optimise
 from perception.progress import QUIET, Progress
 from perception.tasks.folder import has_task, read_facts, read_task, renew_task
 from perception.types import Scene, View
@@ -129,9 +129,7 @@ def _divided(
     ]
 
 
-def optimise_scene(
-    run: Run, scene: Scene, training: list[View], held_out: list[View], source: MaskSource
-) -> Optimised:
+def optimise_scene(run: Run, scene: Scene, training: list[View], held_out: list[View], source: MaskSource) -> Optimised:
     """Trains a scene in one piece, or in blocks where it has more than `train.block_photos`."""
     blocks = cut(scene, run.config.train.block_photos)
     if len(blocks) == 1:
@@ -148,7 +146,6 @@ def optimise_blocks(
     unless the masks or the time limit are others now. A block makes masks of its own where they need depth; others are
     made once per photo.
     """
-    label_by_tasks(run, training, source)
     held = {view.name for view in held_out}
     total = sum(len(block.views) for block in blocks)
     configs = [run.config.part(len(block.views) / total) for block in blocks]

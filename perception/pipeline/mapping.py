@@ -29,7 +29,7 @@ from perception.pipeline.changes import finished, hold_inputs
 from perception.pipeline.checkpoint import check_name, fingerprint, frames_folder, poses_mark, working
 from perception.pipeline.estimate import log_estimate
 from perception.pipeline.instances import DescribedInstances, describe, group_gaussians
-from perception.pipeline.optimise import Optimised, Run
+from perception.pipeline.optimise import Optimised, Run, label_by_tasks
 from perception.pipeline.record import finite, run_record, scored
 from perception.pipeline.splats import SplatInput, open_splat, unchanged
 from perception.progress import QUIET, Progress
@@ -78,6 +78,7 @@ def build_map(
         _log_scene(scene, progress)
 
         # Masks M_v,i of every photo (§3.2), and Gaussians optimised on photos and masks (§3.1 to 3.2.3).
+        label_by_tasks(run, training, masks)
         if splat is None:
             optimised = optimise_scene(run, scene, training, held_out, masks)
         else:  # Gaussians as they are, and features alone

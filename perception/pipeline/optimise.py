@@ -120,7 +120,6 @@ def optimise(
 ) -> Optimised:
     """Trains the Gaussians of a scene, or of the block of one that owns `box` (see `Trainer`), from the checkpoint in
     `run.work` on, if there is one."""
-    label_by_tasks(run, training, source)
     photos = Photos.load(run, training, held_out)
     config = sized(run.config, len(photos.views), largest_budget(memory_limit()))
     start, stereo = _start(run, scene, config, photos)

@@ -19,7 +19,7 @@ from perception.machine import require_memory, return_free_memory
 from perception.masks import MaskSource
 from perception.pipeline.checkpoint import FeatureCheckpoints, frames_folder
 from perception.pipeline.estimate import image_memory
-from perception.pipeline.optimise import Optimised, Photos, Run, label_by_tasks, label_photos
+from perception.pipeline.optimise import Optimised, Photos, Run, label_photos
 from perception.sfm.options import ReadOptions
 from perception.splats.features import new_features, train_features
 from perception.splats.gravity import direction
@@ -60,7 +60,6 @@ class SplatInput:
 
     def optimise(self, run: Run, training: list[View], held_out: list[View], source: MaskSource) -> Optimised:
         """Masks of the views, and features trained on them."""
-        label_by_tasks(run, training, source)
         photos, gaussians = Photos.load(run, training, held_out), self._on(run.device)
         photos, report = label_photos(run, photos, source, partial(surface_depth, gaussians))
         return_free_memory()
