@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,8 +26,8 @@ from perception.io.arrays import read_npz
 from perception.io.atomic import atomic_directory
 from perception.pipeline.checkpoint import digest
 from perception.pipeline.optimise import Optimised, Run
-from perception.progress import QUIET, Progress
-from perception.tasks.folder import RESULT, read_task, renew_task, run_tasks
+from perception.progress import Progress
+from perception.tasks.folder import leaves_result, read_task, renew_task, run_tasks
 from perception.types import Scene
 
 PHOTOS_A_TASK = 64
@@ -59,14 +60,16 @@ def silhouettes_by_tasks(run: Run, optimised: Optimised, levels: Sequence[np.nda
         yield [Silhouettes(packed.tobytes(), tuple(shape.tolist()), *rest) for packed, shape, *rest in rows]
 
 
-def vote_task(folder: str, progress: Progress = QUIET) -> None:
-    """Votes of the photos whose task lies in `folder`, unless they are there."""
-    _of_photos(Path(folder), _votes, progress)
+@leaves_result
+def vote_task(folder: Path, facts: dict[str, Any], new: Path, progress: Progress) -> None:
+    """Votes of some photos."""
+    _of_photos(_votes, folder, new, progress)
 
 
-def silhouette_task(folder: str, progress: Progress = QUIET) -> None:
-    """Silhouettes of the photos whose task lies in `folder`, unless they are there."""
-    _of_photos(Path(folder), _silhouettes, progress)
+@leaves_result
+def silhouette_task(folder: Path, facts: dict[str, Any], new: Path, progress: Progress) -> None:
+    """Silhouettes of some photos."""
+    _of_photos(_silhouettes, folder, new, progress)
 
 
 def _votes(nearby: Nearby, beside: Arrays, view: TrainingView, config: MapConfig) -> Arrays:
@@ -124,12 +127,10 @@ def _write_parts(run: Run, what: str, arrays: Arrays, parts: Sequence[np.ndarray
 
 
 def _of_photos(
-    folder: Path, work: Callable[[Nearby, Arrays, TrainingView, MapConfig], Arrays], progress: Progress
+    work: Callable[[Nearby, Arrays, TrainingView, MapConfig], Arrays], folder: Path, new: Path, progress: Progress
 ) -> None:
-    """Leaves what `work` finds of each photo of the task."""
+    """Writes into `new` what `work` finds of each photo of the task in `folder`."""
     scene, facts = read_task(folder)
-    if (folder / RESULT).is_dir():
-        return
     config, needed = MapConfig.model_validate(facts["config"]), sorted(set().union(*facts["parts"]))
 
     def stored(number: int) -> Arrays:
@@ -147,8 +148,7 @@ def _of_photos(
     device = choose_device(config.device)[0]
     gaussians = Gaussians(**{name: torch.from_numpy(array) for name, array in whole.items()}).to(device)
     nearby = Nearby(gaussians, dict(zip([view.name for view in scene.views], shown, strict=True)))
-    with atomic_directory(folder / RESULT) as new:
-        for done, view in enumerate(scene.views):
-            decoded = with_labels(training_view(view, config.photos.max_side), view, Path(facts["masks"]))
-            np.savez(new / f"{done:04}.npz", **work(nearby, beside, decoded, config))  # type: ignore[arg-type]
-            progress.update("photos", done + 1, len(scene.views))
+    for done, view in enumerate(scene.views):
+        decoded = with_labels(training_view(view, config.photos.max_side), view, Path(facts["masks"]))
+        np.savez(new / f"{done:04}.npz", **work(nearby, beside, decoded, config))  # type: ignore[arg-type]
+        progress.update("photos", done + 1, len(scene.views))

@@ -10,16 +10,16 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from perception.io.atomic import atomic_directory
 from perception.machine import cores
 from perception.photos.ignore_masks import stage_masks
 from perception.photos.lens import load_pycolmap
-from perception.progress import QUIET, Progress
+from perception.progress import Progress
 from perception.sfm.features import extract, import_photos, match
 from perception.sfm.staging import stage_photos
 from perception.tasks.engine import Engine, run_in_processes
-from perception.tasks.folder import RESULT, has_task, read_facts, run_tasks, write_task
+from perception.tasks.folder import RESULT, has_task, leaves_result, run_tasks, write_task
 
 PHOTOS_A_TASK, PAIRS_A_TASK = 64, 2000
 """About half a minute on two cores each."""
@@ -100,34 +100,28 @@ class FeatureTasks:
                 own.execute("DETACH DATABASE source")
 
 
-def extract_task(task: str, progress: Progress = QUIET) -> None:
-    """Extracts the features of the photos whose task lies in folder `task`, unless it is done."""
-    folder, facts = Path(task), read_facts(Path(task))
-    if (folder / RESULT).is_dir():
-        return
+@leaves_result
+def extract_task(folder: Path, facts: dict[str, Any], new: Path, progress: Progress) -> None:
+    """Extracts the features of some photos."""
     photos, masks, as_stored = [Path(photo) for photo in facts["photos"]], facts["masks"], facts["as_stored"]
-    with atomic_directory(folder / RESULT) as new:
-        names = stage_photos(new / "photos", photos, progress, as_stored)
-        if masks is not None:
-            stage_masks(new / "masks", photos, names, [mask and Path(mask) for mask in masks], as_stored)
-        groups = import_photos(new / DATABASE, new / "photos", photos, names, [None] * len(photos))
-        extract(new / DATABASE, new / "photos", groups, progress)
+    names = stage_photos(new / "photos", photos, progress, as_stored)
+    if masks is not None:
+        stage_masks(new / "masks", photos, names, [mask and Path(mask) for mask in masks], as_stored)
+    groups = import_photos(new / DATABASE, new / "photos", photos, names, [None] * len(photos))
+    extract(new / DATABASE, new / "photos", groups, progress)
 
 
-def match_task(task: str, progress: Progress = QUIET) -> None:
-    """Matches the pairs whose task and database lie in folder `task`, unless it is done."""
-    folder, facts = Path(task), read_facts(Path(task))
-    if (folder / RESULT).is_dir():
-        return
-    with atomic_directory(folder / RESULT) as new:
-        source = facts["database"] or folder / DATABASE
-        with closing(sqlite3.connect(source)) as given, closing(sqlite3.connect(new / DATABASE)) as copy:
-            given.backup(copy)
-        match(new / DATABASE, facts["pairs"], facts["seed"], progress)
-        with closing(sqlite3.connect(new / DATABASE, isolation_level=None)) as copy:
-            for table in _FEATURES:  # 0.3 MB a photo, in the copy of every task
-                copy.execute(f"DELETE FROM {table}")
-            copy.execute("VACUUM")
+@leaves_result
+def match_task(folder: Path, facts: dict[str, Any], new: Path, progress: Progress) -> None:
+    """Matches some pairs, of the photos in its own database or in that of this machine."""
+    source = facts["database"] or folder / DATABASE
+    with closing(sqlite3.connect(source)) as given, closing(sqlite3.connect(new / DATABASE)) as copy:
+        given.backup(copy)
+    match(new / DATABASE, facts["pairs"], facts["seed"], progress)
+    with closing(sqlite3.connect(new / DATABASE, isolation_level=None)) as copy:
+        for table in _FEATURES:  # 0.3 MB a photo, in the copy of every task
+            copy.execute(f"DELETE FROM {table}")
+        copy.execute("VACUUM")
 
 
 def _images(database: sqlite3.Connection) -> dict[str, int]:

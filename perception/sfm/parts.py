@@ -16,9 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from perception.io.atomic import atomic_directory
 from perception.photos.lens import load_pycolmap
-from perception.progress import QUIET, Progress
+from perception.progress import Progress
 from perception.sfm.alignment import Poses, moved_pose, pose_of, similarities
 from perception.sfm.database import FeatureStore
 from perception.sfm.feature_tasks import write_part
@@ -26,7 +25,7 @@ from perception.sfm.incremental import pipeline_options
 from perception.sfm.merge import refined, triangulated
 from perception.sfm.options import ReadOptions
 from perception.sfm.partition import LARGEST, Matches
-from perception.tasks.folder import RESULT, has_task, read_facts, run_tasks, write_task
+from perception.tasks.folder import has_task, leaves_result, run_tasks, write_task
 
 WHOLE = 10_000
 """Photos up to which one bundle adjustment goes over all: 17 minutes and .6 GB of the driver."""
@@ -136,12 +135,9 @@ def _run(
     return map(load_pycolmap().Reconstruction, results)
 
 
-def part_task(task: str, progress: Progress = QUIET) -> None:
-    """Triangulates the points of the part whose task lies in folder `task`, and adjusts its poses if it says so; writes
-    the model to RESULT there."""
-    folder, facts = Path(task), read_facts(Path(task))
-    if (folder / RESULT).is_dir():
-        return
+@leaves_result
+def part_task(folder: Path, facts: dict[str, Any], new: Path, progress: Progress) -> None:
+    """Triangulates the points of a part, and adjusts its poses if the task says so."""
     load_pycolmap().set_random_seed(facts["seed"])
     model, options = load_pycolmap().Reconstruction(folder / MODEL), pipeline_options(True, facts["seed"], True)
     store = FeatureStore(Path(facts["database"]).parent, Path(facts["photos"]), [], {})
@@ -151,5 +147,4 @@ def part_task(task: str, progress: Progress = QUIET) -> None:
         model = refined(model, store, options, add=False)
     else:
         model.extract_colors_for_all_images(store.image_root)
-    with atomic_directory(folder / RESULT) as new:
-        model.write(new)
+    model.write(new)

@@ -10,16 +10,16 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
-from perception.io.atomic import atomic_directory
-from perception.progress import QUIET, Progress
+from perception.progress import Progress
 from perception.sfm import incremental, merge, partition, parts
 from perception.sfm.consistency import is_contradicted, outvoted_photos, verified_pairs
 from perception.sfm.database import FeatureStore, verified_matches
 from perception.sfm.feature_tasks import write_part
 from perception.sfm.incremental import map_photos, pipeline_options, take_out
 from perception.sfm.options import ReadOptions
-from perception.tasks.folder import RESULT, has_task, read_facts, run_tasks, write_task
+from perception.tasks.folder import has_task, leaves_result, run_tasks, write_task
 
 
 def map_submodels(store: FeatureStore, options: ReadOptions) -> incremental.Mapped | None:
@@ -66,12 +66,9 @@ def _task(store: FeatureStore, images: list[int], number: int, fixed: bool, seed
     return folder
 
 
-def submodel_task(task: str, progress: Progress = QUIET) -> None:
-    """Maps the submodel whose task lies in folder `task`, and writes its models to RESULT there."""
-    folder, facts = Path(task), read_facts(Path(task))
-    if (folder / RESULT).is_dir():
-        return
+@leaves_result
+def submodel_task(folder: Path, facts: dict[str, Any], new: Path, progress: Progress) -> None:
+    """Maps a submodel."""
     store = FeatureStore(folder, Path(facts["photos"]), [], {})
     models, _ = map_photos(store, pipeline_options(facts["fixed"], facts["seed"], True), facts["count"], progress)
-    with atomic_directory(folder / RESULT) as new:
-        incremental.write_models(models, new)
+    incremental.write_models(models, new)

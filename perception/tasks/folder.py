@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import platform
 from collections.abc import Callable, Sequence
@@ -11,13 +12,15 @@ from pathlib import Path
 from typing import Any
 
 from perception.errors import InputError
-from perception.io.atomic import write_file
+from perception.io.atomic import atomic_directory, write_file
 from perception.photos.scene_file import load_saved_scene, save_scene
-from perception.progress import Progress
+from perception.progress import QUIET, Progress
 from perception.tasks.engine import Engine
 from perception.types import Scene
 
 TASK, SCENE, RESULT = "task.json", "scene", "result"
+Work = Callable[[Path, dict[str, Any], Path, Progress], None]
+"""Of a task: its folder, its facts, the new folder for what it makes."""
 
 
 def write_task(folder: Path, scene: Scene | None = None, **facts: Any) -> None:
@@ -61,6 +64,19 @@ def read_task(folder: Path) -> tuple[Scene, dict[str, Any]]:
     return scene, facts
 
 
+def leaves_result(work: Work) -> Callable[..., None]:
+    """The task (folder, progress) of `run_tasks` that does `work` and leaves RESULT; nothing where that is there."""
+
+    @functools.wraps(work)
+    def task(folder: str, progress: Progress = QUIET) -> None:
+        facts, result = read_facts(Path(folder)), Path(folder) / RESULT
+        if not result.is_dir():
+            with atomic_directory(result) as new:
+                work(Path(folder), facts, new, progress)
+
+    return task
+
+
 def run_tasks(
     engine: Engine,
     task: Callable[..., Any],
@@ -69,7 +85,7 @@ def run_tasks(
     progress: Progress,
     each_core: bool = False,
 ) -> list[Path]:
-    """Runs the task in each folder (see `Engine.run`), which leaves a folder RESULT there; returns those."""
+    """Runs a task of `leaves_result` in each folder (see `Engine.run`); returns the results."""
     engine.run(task, [str(folder.resolve()) for folder in folders], what, progress, each_core)
     for folder in folders:
         if not (folder / RESULT).is_dir():
