@@ -5,10 +5,12 @@ from __future__ import annotations
 import networkx as nx
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import eigsh
+from scipy.sparse.linalg import LinearOperator, eigsh, splu
 
 LARGEST, OVERLAP = 100, 15
 """Photos of a submodel at most, and photos that each submodel next to it adds."""
+NUDGE = 1e-6
+"""Added to the eigenvalues of a Laplacian, of which the least is 0, so that it has an inverse."""
 SIDE = 0.25
 """Least share of the photos on either side of a cut."""
 
@@ -49,9 +51,9 @@ def _upper_half(weights: sparse.csr_matrix) -> np.ndarray:
     start = np.random.default_rng(0).normal(size=count)  # ARPACK's own is random
     # The Laplacian's two least eigenvalues, near each other along a walk, as the largest of its inverse: by the matrix
     # itself, 4,000 photos took a minute.
-    laplacian = (sparse.identity(count) - scaled @ weights @ scaled).tocsc()
-    values, vectors = eigsh(laplacian, k=2, sigma=-1e-6, v0=start)
-    vector = vectors[:, values.argmax()] * degree**-0.5
+    laplacian = (1 + NUDGE) * sparse.identity(count) - scaled @ weights @ scaled
+    solve = splu(laplacian.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0, options={"SymmetricMode": True}).solve
+    vector = eigsh(LinearOperator(laplacian.shape, solve), k=2, v0=start)[1][:, 0] * degree**-0.5
     order = np.argsort(vector, kind="stable")
     rank = np.argsort(order, kind="stable")
     upper = sparse.triu(weights).tocoo()
