@@ -104,7 +104,10 @@ def after_step(state: TrainingState, progress: float, may_stop: bool) -> None:
             _clear_cameras(state)
     if state.iteration % (5 * every) == 0 and state.progress < 1.0:
         _add_to_curve(state, progress)
-    if progress < STOP <= state.progress and state.has_labels and not state.held:  # an update adds in its own way
+    if (
+        state.progress >= STOP and state.has_labels and not (state.placed or state.held)
+    ):  # an update adds in its own way
+        state.placed = True
         _place_in_masks(state)
     if due and may_stop:
         _stop_early(state)

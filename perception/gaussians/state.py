@@ -106,6 +106,7 @@ class TrainingState:
         self.iteration = 0
         self.complete = False  # finished, unless a longer training is requested
         self.skipped = 0.0  # share of training progress skipped by early stopping
+        self.placed = False  # masks that had too few Gaussians were given some
         self.initial_count = len(gaussians)
         self.free_space = FreeSpace(gaussians.means.cpu().double().numpy(), views) if by_stereo else None
         self.gaussians = gaussians.to(self.device)
@@ -214,6 +215,7 @@ class TrainingState:
             "record": asdict(self.record) | {"seconds": self.elapsed, "iterations": self.iteration},
             "stopping": asdict(self.stopping),
             "skipped": self.skipped,
+            "placed": self.placed,
             "complete": self.complete,
         }
 
@@ -228,4 +230,4 @@ class TrainingState:
         self.record = TrainRecord(**state["record"])
         self.iteration, self.initial_count = state["iteration"], state["initial_count"]
         self.stopping = EarlyStopping(**state["stopping"])
-        self.skipped, self.complete = state["skipped"], state["complete"]
+        self.skipped, self.placed, self.complete = (state[name] for name in ("skipped", "placed", "complete"))

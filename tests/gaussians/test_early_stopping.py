@@ -9,6 +9,7 @@ import shutil
 import signal
 import weakref
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -219,6 +220,30 @@ def test_the_time_between_two_legs_is_not_training(monkeypatch: pytest.MonkeyPat
     now[0] += 1000
     assert trainer.elapsed == 3
     assert trainer.run(Clock()).seconds == trainer.record.iterations == 10
+
+
+def test_masks_get_their_gaussians_whenever_growth_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a time limit, growth may end between two steps, as while a checkpoint is written: no mask got any. Once only:
+    checkpoints know."""
+    now, placed = [100.0], list[float]()
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    monkeypatch.setattr(schedule, "_place_in_masks", lambda state: placed.append(state.progress))
+    words = ("train.iterations=1000", "train.time_limit=10")
+    trainer, resumed = (small_trainer(*words) for _ in range(2))
+    for one in (trainer, resumed):
+        one.show([replace(view, labels=torch.ones(view.photo.shape[:2], dtype=torch.uint8)) for view in one.views])
+
+    class Clock:
+        def after_step(self, trainer: Trainer, loss: float) -> None:
+            now[0] += 1
+
+        def after_leg(self, trainer: Trainer) -> None: ...
+
+    trainer.run(Clock(), until=0.8)
+    assert placed == [pytest.approx(0.6)]
+    resumed.load(copy.deepcopy(trainer.state()))
+    resumed.run(Clock())
+    assert len(placed) == 1
 
 
 @pytest.mark.usefixtures("interruptible")
