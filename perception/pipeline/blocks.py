@@ -129,14 +129,6 @@ def _divided(
     ]
 
 
-def optimise_scene(run: Run, scene: Scene, training: list[View], held_out: list[View], source: MaskSource) -> Optimised:
-    """Trains a scene in one piece, or in blocks where it has more than `train.block_photos`."""
-    blocks = cut(scene, run.config.train.block_photos)
-    if len(blocks) == 1:
-        return optimise(run, scene, training, held_out, source)
-    return optimise_blocks(blocks, run, scene, training, held_out, source)
-
-
 def optimise_blocks(
     blocks: list[Block], run: Run, scene: Scene, training: list[View], held_out: list[View], source: MaskSource
 ) -> Optimised:

@@ -24,12 +24,12 @@ from perception.masks import MaskSource, make_source
 from perception.masks.compute import load_segmentation
 from perception.photos.scene_file import load_saved_scene, save_scene
 from perception.photos.view_json import stored_view
-from perception.pipeline.blocks import optimise_scene
+from perception.pipeline.blocks import cut, optimise_blocks
 from perception.pipeline.changes import finished, hold_inputs
 from perception.pipeline.checkpoint import check_name, fingerprint, frames_folder, poses_mark, working
 from perception.pipeline.estimate import log_estimate
 from perception.pipeline.instances import DescribedInstances, describe, group_gaussians
-from perception.pipeline.optimise import Optimised, Run, label_by_tasks
+from perception.pipeline.optimise import Optimised, Run, label_by_tasks, optimise
 from perception.pipeline.record import finite, run_record, scored
 from perception.pipeline.splats import SplatInput, open_splat, unchanged
 from perception.progress import QUIET, Progress
@@ -79,10 +79,12 @@ def build_map(
 
         # Masks M_v,i of every photo (§3.2), and Gaussians optimised on photos and masks (§3.1 to 3.2.3).
         label_by_tasks(run, training, masks)
-        if splat is None:
-            optimised = optimise_scene(run, scene, training, held_out, masks)
-        else:  # Gaussians as they are, and features alone
+        if splat is not None:  # Gaussians as they are, and features alone
             optimised = splat.optimise(run, training, held_out, masks)
+        elif len(blocks := cut(scene, config.train.block_photos)) == 1:
+            optimised = optimise(run, scene, training, held_out, masks)
+        else:
+            optimised = optimise_blocks(blocks, run, scene, training, held_out, masks)
         segments = load_segmentation(run.masks) if masks.needs_depth else None
         del masks  # with its images
 

@@ -223,8 +223,8 @@ def test_the_time_between_two_legs_is_not_training(monkeypatch: pytest.MonkeyPat
 
 
 def test_masks_get_their_gaussians_whenever_growth_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With a time limit, growth may end between two steps, as while a checkpoint is written: no mask got any. Once only:
-    checkpoints know."""
+    """With a time limit, growth may end between two steps, as while a checkpoint is written: no mask got any. They get
+    them once: checkpoints know."""
     now, placed = [100.0], list[float]()
     monkeypatch.setattr("time.monotonic", lambda: now[0])
     monkeypatch.setattr(schedule, "_place_in_masks", lambda state: placed.append(state.progress))
