@@ -49,7 +49,7 @@ def start_on_surface(
     """One Gaussian per voxel of the fused depth of `views`, and per sparse point where no depth was measured.
 
     points [P, 3], colors [P, 3] uint8: sparse points. None when no depth was measured. At most SHARE of the budget is
-    used.
+    used, but eight Gaussians where that is less.
     """
     most = max(8, int(SHARE * budget))  # the voxels that meet at the origin are eight, whatever their side
     cloud = fuse_depth(views, most)

@@ -98,7 +98,8 @@ def _by_labels(means: np.ndarray, opacities: np.ndarray, votes: MaskVotes) -> np
     weights = votes.of_labels()
     ids = np.full(len(means), -1, np.int32)
     shown = np.diff(weights.indptr) > 0
-    ids[shown] = np.asarray(weights[shown].argmax(axis=1)).reshape(-1)
+    if shown.any():  # scipy refuses the largest of nothing
+        ids[shown] = np.asarray(weights[shown].argmax(axis=1)).reshape(-1)
     ids[(opacities < MIN_OPACITY) | ~np.isfinite(means).all(axis=1)] = -1
     return ids
 

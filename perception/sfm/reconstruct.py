@@ -33,7 +33,8 @@ from perception.sfm.options import ReadOptions
 from perception.sfm.submodels import map_submodels
 from perception.types import Scene
 
-MIN_PHOTOS = 3
+MIN_PHOTOS, FEW_MATCHES = 3, 30
+"""Least number of photos; verified matches with the best partner below which a photo overlaps the others too little."""
 AT_ONCE = "at-once"
 """Folder in that of the features."""
 
@@ -171,6 +172,6 @@ def _reason(name: str, contradicted: set[str], others: list[set[str]], matches: 
         return "registered in another, smaller model that does not connect to the largest"
     if features < FEW_FEATURES:
         return f"too few features ({features}): blurred, dark or without texture"
-    if best < 30:
+    if best < FEW_MATCHES:
         return f"too few verified matches (best partner: {best}): too little overlap with the other photos"
     return f"matches found (best partner: {best}), but no consistent pose"

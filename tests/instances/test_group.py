@@ -236,6 +236,14 @@ def test_labels_of_one_surface_are_the_instances_whatever_features_and_seed_say(
         np.testing.assert_array_equal(found.ids, truth)
 
 
+def test_one_surface_without_masks_has_no_instances() -> None:
+    """Labels one pixel wide may all fall between the pixels of half the resolution: grouping ended with an error."""
+    none = sparse.csr_matrix((5, 0), dtype=np.float32)
+    votes = MaskVotes(none, none, np.zeros(0, np.int64), np.zeros(0))
+    five = np.eye(5, 3), np.full((5, 3), 0.1), np.full(5, 0.8), np.zeros((5, 4), np.float32)
+    assert group(*five, votes, InstanceConfig(), one_surface=True).count == 0
+
+
 def test_an_object_cut_by_every_border() -> None:
     scene = make_scene(row(1), CODES[:1, :8], orbit(6, 0.55, 0.1, np.zeros(3)), radius=0.5, each=600)
     found = run(scene)
