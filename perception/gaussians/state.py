@@ -134,14 +134,15 @@ class TrainingState:
     @property
     def progress(self) -> float:
         limit = self.config.train.time_limit
-        return min(1.0, self._share if limit is None else max(self._share, self.elapsed / limit))
+        return min(1.0, self._share if limit is None else max(self._share, self.elapsed / limit + self.skipped))
 
     @property
     def expected_iterations(self) -> int:
         """Estimate of the total number of iterations of the run."""
         progress = self.progress
         if progress > self._share:  # the time limit determines progress
-            return max(self.iteration, round(self.iteration / max(progress, 1e-6)))
+            spent = max(progress - self.skipped, 1e-6)
+            return max(self.iteration, round(self.iteration * (1 - self.skipped) / spent))
         return round(self.iteration + (1 - progress) * self.config.train.iterations)
 
     def show(self, views: list[TrainingView]) -> None:

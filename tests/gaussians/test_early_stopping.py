@@ -222,6 +222,29 @@ def test_the_time_between_two_legs_is_not_training(monkeypatch: pytest.MonkeyPat
     assert trainer.run(Clock()).seconds == trainer.record.iterations == 10
 
 
+def test_a_plateau_ends_training_before_its_time_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the limit decides on progress, the skipped share did not count: the record told of it, and training went on
+    to the limit."""
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    trainer = small_trainer(
+        "train.iterations=10000", "train.time_limit=200", "train.exchange_db=1000", "densify.every=1"
+    )
+    shown = list[tuple[int, int]]()
+
+    class Clock:
+        def after_step(self, trainer: Trainer, loss: float) -> None:
+            now[0] += 1
+            shown.append((trainer.iteration, trainer.expected_iterations))
+
+        def after_leg(self, trainer: Trainer) -> None: ...
+
+    record = trainer.run(Clock())
+    assert any("of the training skipped" in decision for decision in record.decisions)
+    assert record.iterations == pytest.approx(200 * (1 - trainer.skipped), abs=2) and trainer.skipped > 0.2
+    assert shown[-1] == (record.iterations, record.iterations) and shown[50][1] == pytest.approx(200, abs=5)
+
+
 def test_masks_get_their_gaussians_whenever_growth_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     """With a time limit, growth may end between two steps, as while a checkpoint is written: no mask got any. They get
     them once: checkpoints know."""
