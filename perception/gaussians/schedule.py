@@ -141,7 +141,8 @@ def _densify(state: TrainingState, progress: float) -> None:
         seed = int(np.random.default_rng([config.seed, state.iteration, 2]).integers(2**31))
         if state.stopping.growing:
             _grow(state, _allowed(state, progress), seed)
-        turn = round((progress - START) * config.train.iterations / config.densify.every)
+        begun = (state.iteration - 1) / config.train.iterations  # not `progress`, of which a time limit may decide
+        turn = round((begun - START) * config.train.iterations / config.densify.every)
         if turn % FILL_EVERY == 0:
             _fill(state, seed)
         state.arrange()

@@ -222,6 +222,29 @@ def test_the_time_between_two_legs_is_not_training(monkeypatch: pytest.MonkeyPat
     assert trainer.run(Clock()).seconds == trainer.record.iterations == 10
 
 
+@pytest.mark.parametrize("limit", [400, 440, 500])
+def test_holes_are_filled_at_every_fifth_densification_also_with_a_time_limit(
+    monkeypatch: pytest.MonkeyPatch, limit: int
+) -> None:
+    """Progress by time made one densification count as five: holes were filled at every one, or never."""
+    now, filled, grown = [100.0], list[int](), list[int]()
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    monkeypatch.setattr(schedule, "_fill", lambda state, seed: filled.append(state.iteration))
+    monkeypatch.setattr(schedule, "_grow", lambda state, allowed, seed: grown.append(state.iteration))
+    words = ("train.iterations=2000", f"train.time_limit={limit}", "train.exchange_db=0", "densify.every=20")
+    trainer = small_trainer(*words)
+
+    class Clock:
+        def after_step(self, trainer: Trainer, loss: float) -> None:
+            now[0] += 1
+
+        def after_leg(self, trainer: Trainer) -> None: ...
+
+    trainer.run(Clock(), until=0.6)
+    assert len(grown) == round(0.55 * limit / 20) and 2 <= len(filled) <= 3
+    assert set(np.diff(filled)) == {100}
+
+
 def test_a_plateau_ends_training_before_its_time_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the limit decides on progress, the skipped share did not count: the record told of it, and training went on
     to the limit."""
