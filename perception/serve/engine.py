@@ -6,6 +6,7 @@ Servers (HTTP, ROS) only convert messages. Queueing, rejection, time-outs and re
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import threading
 import time
@@ -155,10 +156,10 @@ class QueryEngine:
                 fresh = self.open_map()
             except Exception as error:  # of any class: people edit instances.json by hand
                 raise self._unreadable(error) from error
-            self._signature, self._problem, old = signature, None, self._map
-            self._map = fresh
+            known = self._map.map_id
+            self._signature, self._problem, self._map = signature, None, fresh
             self._counters.count("reloads")
-            if fresh.map_id == old.map_id:
+            if fresh.map_id == known:
                 return False
             self._unserved = None
             for listener in list(self._listeners):
@@ -167,6 +168,7 @@ class QueryEngine:
                 except Exception as error:
                     _log.error("%s: not all of the new map can be served", self.path, exc_info=error)
                     self._unserved = f"{self.path}: not all of the map can be served ({_brief(error)})"
+            gc.collect()  # a map lies in circles of references: else maps pile up, as Python does not count their arrays
             return True
 
     def _unreadable(self, error: Exception) -> InputError:
@@ -256,14 +258,15 @@ class QueryEngine:
     # ----------------------------------------------------------------- workers
 
     def _work(self) -> None:
+        own = threading.get_ident()
         while (job := self._queue.get()) is not None:
             if time.monotonic() > job.deadline:
                 self._drop(job)
             elif job.future.set_running_or_notify_cancel():
-                own = threading.get_ident()
                 self._busy_since[own] = time.monotonic()
                 self._answer(job)
                 del self._busy_since[own]
+            del job  # its answer holds the map
 
     def _drop(self, job: Job) -> None:
         """Ends a job with AnswerTimeout, unless its future was cancelled."""
@@ -317,9 +320,9 @@ class RequestQueue:
         late: list[Job] = []
         with self._changed:
             if len(self._jobs) >= self.most:
-                now = time.monotonic()
-                late = [waiting for waiting in self._jobs if waiting.future.cancelled() or now > waiting.deadline]
-                self._jobs = deque(waiting for waiting in self._jobs if waiting not in late)
+                now, before, self._jobs = time.monotonic(), self._jobs, deque()
+                for waiting in before:
+                    (late if waiting.future.cancelled() or now > waiting.deadline else self._jobs).append(waiting)
             taken = self._open and len(self._jobs) < self.most
             if taken:
                 self._jobs.append(job)

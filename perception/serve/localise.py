@@ -8,10 +8,10 @@ import threading
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeout
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from PIL import Image
@@ -104,21 +104,26 @@ def localised(gmap: QueryMap, picture: bytes, lens: Lens | None, photos: Path | 
         return localiser.answers([NewPhoto("picture", file, lens)])[0]
 
 
+_beginning = threading.Lock()
+_localisers = WeakKeyDictionary[QueryMap, Future[Localiser]]()
+
+
 def localiser_of(gmap: QueryMap, photos: Path | None) -> Localiser:
     """The localiser of a map. EngineBusy while its photos are being read, which begins with the first question."""
+    with _beginning:
+        made = _localisers[gmap] = _localisers.get(gmap) or _begun(gmap, photos)
     try:
-        return _made(gmap, photos).result(WAIT)
+        return made.result(WAIT)
     except FutureTimeout:
         raise EngineBusy("the map's photos are being read to localise others; ask again in a minute") from None
     except Exception:
-        _made.cache_clear()  # the next question tries anew: a full disk may have been cleared
+        _localisers.pop(gmap, None)  # the next question tries anew: a full disk may have been cleared
         raise
 
 
-@lru_cache(maxsize=1)
-def _made(gmap: QueryMap, photos: Path | None) -> Future[Localiser]:
-    """Makes the localiser of the last map that was asked for. A map from others may name any file, so only photos in
-    its folder and in `photos` are read."""
+def _begun(gmap: QueryMap, photos: Path | None) -> Future[Localiser]:
+    """Makes the localiser of a map in a thread. A map from others may name any file, so only photos in its folder and
+    in `photos` are read."""
 
     def locate(view: View) -> View:
         return replace(readable_view(gmap, view, photos), depth=None, mask=None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import gc
 import json
 import threading
 from collections.abc import Iterator
@@ -19,6 +20,7 @@ from perception.errors import InputError
 from perception.node import answers
 from perception.node.config import NodeConfig
 from perception.node.localise import Localising
+from perception.query import QueryMap
 from perception.serve import localise as served
 from perception.serve.bodies import parse
 from perception.serve.engine import QueryEngine
@@ -106,21 +108,24 @@ def test_the_first_question_is_told_to_come_again(folder: Path, monkeypatch: pyt
         go.set()
         monkeypatch.setattr(served, "WAIT", 60.0)
         assert served.localiser_of(other.current, None) is True
-    served._made.cache_clear()
 
 
 def test_a_failure_to_read_the_photos_is_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: Any, **__: Any) -> Any:
         raise InputError("/tmp: its disk has 3 MiB free")
 
-    gmap: Any = object()
+    gmap = QueryMap()
     monkeypatch.setattr(served, "WAIT", 60.0)
     monkeypatch.setattr(served, "Localiser", full)
     with pytest.raises(InputError, match="3 MiB"):
         served.localiser_of(gmap, None)
     monkeypatch.setattr(served, "Localiser", lambda *_, **__: True)
     assert served.localiser_of(gmap, None) is True
-    served._made.cache_clear()
+    assert gmap in served._localisers
+    count = len(served._localisers)
+    del gmap
+    gc.collect()
+    assert len(served._localisers) < count  # it goes with its map
 
 
 @pytest.mark.slow
@@ -129,7 +134,6 @@ def test_as_a_tool_with_a_picture_or_a_file_of_an_allowed_folder(engine: QueryEn
     from perception.serve.mcp import TOOLS
 
     gmap, photos = engine.current, folder / "photos"
-    served._made(gmap, photos).result(300)
     for given in ({"picture": text_of(photos / "new.png")}, {"file": "new.png"}, {"file": str(photos / "new.png")}):
         answer, _ = parse(TOOLS["localise"], given).answered(gmap, photos)
         assert answer["localised"] and np.allclose(answer["pose"], TRUTH, atol=0.003) and answer["unit"] == "m"
@@ -171,7 +175,6 @@ def image_of(photo: Path) -> SimpleNamespace:
 
 @pytest.mark.slow
 def test_on_ros(engine: QueryEngine, folder: Path) -> None:
-    served._made(engine.current, folder / "photos").result(300)
     heard = Heard()
     node = Localising(engine, heard, NodeConfig(photos=str(folder / "photos")))
     info = {"k": CAMERA["camera_matrix"], "d": [0.0] * 5, "p": [], "distortion_model": "plumb_bob"}

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -321,6 +322,15 @@ def test_memory_of_answers_is_let_go(path: Path) -> None:
             engine.ask(Request(f"thing {number}", min_score=0.0))
         assert engine.current._ranking._remembered.cache_info().currsize <= 256
         assert np.array_equal(engine.ask("mug").hits[0].points, engine.current.get(0).points)
+
+
+def test_a_map_that_was_replaced_leaves_memory_with_its_last_answers(path: Path) -> None:
+    with engine_of(path, workers=2) as engine:
+        old = weakref.ref(engine.current)
+        for _ in range(4):
+            assert engine.ask("mug").hits
+        set_labels(path, {0: "cup"})
+        assert engine.reload() and old() is None
 
 
 def _until(condition, seconds: float = 30.0) -> None:
