@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 from perception.colors import instance_palette, rgb8_from_sh
 from perception.edit.editor import Editor
 from perception.errors import InputError
+from perception.language.encoders import make_encoder
 from perception.map.write import Map
 from perception.pictures import features_to_rgb
 from perception.query import Hit, QueryMap
@@ -61,13 +63,13 @@ class Session:
         self.hits: list[Hit] = []
         self.gone: list[Hit] = []
         self.measuring, self.ends, self.notes = False, list[np.ndarray](), list[str]()
-        self._opened: tuple[int, QueryMap] | None = None
-        self._edits = 0
+        self._encoders = lru_cache(make_encoder)  # one for the maps of all edits
+        self._opened: QueryMap | None = None
 
     def _loaded(self) -> QueryMap:
-        if self._opened is None or self._opened[0] != self._edits:
-            self._opened = (self._edits, QueryMap.of(self.editor.current()))
-        return self._opened[1]
+        if self._opened is None:
+            self._opened = QueryMap.of(self.editor.current(), encoders=self._encoders)
+        return self._opened
 
     def ask(self, text: str, top_k: int = 5) -> list[Hit]:
         """Ranked hits, which are then highlighted; empty when the text is not present. None is hidden."""
@@ -143,7 +145,7 @@ class Session:
 
     def edited(self) -> None:
         """To be called after an edit: removes what no longer exists from the selection and the hits."""
-        self._edits += 1
+        self._opened = None
         known = {entry["id"] for entry in self.editor.instances}
         parts = {part["id"] for entry in self.editor.instances for part in entry.get("parts", [])}
         self.selected = [instance for instance in self.selected if instance in known]

@@ -16,8 +16,9 @@ from perception.errors import InputError
 from perception.io.atomic import atomic_file
 from perception.map.write import write_map
 from perception.viewer.picking import covariances, pick
-from perception.viewer.session import HIGHLIGHT, MODES, highlight, paint
+from perception.viewer.session import HIGHLIGHT, MODES, Session, highlight, paint
 from support.processes import hears_ctrl_c
+from support.query_maps import HashEncoder, encoders, write_map_of
 from support.viewer_maps import free_port, small_map
 
 
@@ -69,6 +70,22 @@ def test_covariances_are_those_of_the_rotated_axes() -> None:
     for i, found in enumerate(covariances(gmap)):
         axes = rotation_from_quaternion(gmap.quats[i]) * np.exp(gmap.log_scales[i].astype(float))
         np.testing.assert_allclose(found, axes @ axes.T, rtol=1e-4, atol=1e-7)
+
+
+def test_an_encoder_is_loaded_once_whatever_is_edited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[str] = []
+
+    def make(spec: str) -> HashEncoder:
+        made.append(spec)
+        return encoders(spec)
+
+    monkeypatch.setattr("perception.viewer.session.make_encoder", make)
+    session = Session(write_map_of(tmp_path / "a.gsmap", gaussians=200))
+    for name in ("cup", "beaker", "tin"):
+        session.editor.rename(0, name)
+        session.edited()
+        assert [hit.label for hit in session.ask(name)] == [name]
+    assert made == ["hash"]
 
 
 @pytest.mark.parametrize("mode", MODES)
