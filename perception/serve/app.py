@@ -70,10 +70,11 @@ def build_app(engine: QueryEngine, settings: ServeSettings) -> FastAPI:
         dependencies=[Depends(refuse_unknown)],
     )
     app.add_middleware(HttpGuard, settings=settings)
+    queries = MapQueries(engine)
     add_state(app, engine)
-    add_searches(app, MapQueries(engine))
-    add_instances(app, MapQueries(engine))
-    add_localising(app, MapQueries(engine), settings)
+    add_searches(app, queries)
+    add_instances(app, queries)
+    add_localising(app, queries, settings)
     return app
 
 
@@ -97,15 +98,19 @@ class MapQueries:
         future = self.engine.run(lambda gmap: work(gmap if at is None else gmap.at(at)), map_id=map_id)
         return await self.engine.awaited(future)
 
-    async def hits(
-        self, map_id: str | None, at: int | None, frame: Frame | None, work: Callable[[QueryMap], Sequence[Hit]]
+    async def answer(
+        self, work: Callable[[QueryMap], dict[str, Any]], map_id: str | None, at: int | None, frame: Frame | None = None
     ) -> Response:
-        """The hits that `work` finds, in `frame`."""
+        """What `work` tells of the map, in `frame`, with the facts of the map and its visits."""
 
         def answer(gmap: QueryMap) -> dict[str, Any]:
-            return {"hits": [hit.to_json() for hit in work(gmap)], **source(gmap, frame), **gmap.visits_json()}
+            return {**work(gmap), **source(gmap, frame), **gmap.visits_json()}
 
         return JSONResponse(await self.result(map_id, at, answer))
+
+
+def _hits(found: Sequence[Hit]) -> dict[str, Any]:
+    return {"hits": [hit.to_json() for hit in found]}
 
 
 def add_localising(app: FastAPI, queries: MapQueries, settings: ServeSettings) -> None:
@@ -154,61 +159,52 @@ def add_searches(app: FastAPI, queries: MapQueries) -> None:
     async def query(body: QueryBody, map_id: MapId = None) -> Response:
         """The instances that answer each text, ranked; for a text that is refused, unless all are, "error" instead."""
         requests = body.requests()
-
-        def work(gmap: QueryMap) -> dict[str, Any]:
-            return {"results": answers(gmap, requests), **source(gmap, requests[0].frame), **gmap.visits_json()}
-
-        return JSONResponse(await queries.result(map_id, None, work))
+        return await queries.answer(lambda gmap: {"results": answers(gmap, requests)}, map_id, None, requests[0].frame)
 
     @app.post("/find")
     async def find(body: FindBody, map_id: MapId = None) -> Response:
         """All instances that fulfil a filter."""
         where, frame = body.query_where(), body.query_frame()
-        return await queries.hits(map_id, body.at, frame, lambda gmap: gmap.find(where, frame=frame))
+        return await queries.answer(lambda gmap: _hits(gmap.find(where, frame=frame)), map_id, body.at, frame)
 
     @app.post("/nearest")
     async def nearest(body: NearestBody, map_id: MapId = None) -> Response:
         """The instances nearest to a point or pose."""
         where, frame, near = body.query_where(), body.query_frame(), np.array(body.near)
-        return await queries.hits(
-            map_id, body.at, frame, lambda gmap: gmap.nearest(near, body.top_k or 1, where=where, frame=frame)
-        )
+
+        def work(gmap: QueryMap) -> dict[str, Any]:
+            return _hits(gmap.nearest(near, body.top_k or 1, where=where, frame=frame))
+
+        return await queries.answer(work, map_id, body.at, frame)
 
     @app.post("/at")
     async def at(body: AtBody, map_id: MapId = None) -> Response:
         """The instance that a point lies on."""
         frame = body.query_frame()
 
-        def work(gmap: QueryMap) -> list[Hit]:
+        def work(gmap: QueryMap) -> dict[str, Any]:
             hit = gmap.instance_at(np.array(body.point), max_distance=body.max_distance, frame=frame)
-            return [] if hit is None else [hit]
+            return _hits([] if hit is None else [hit])
 
-        return await queries.hits(map_id, body.at, frame, work)
+        return await queries.answer(work, map_id, body.at, frame)
 
 
 def add_instances(app: FastAPI, queries: MapQueries) -> None:
     @app.get("/instances")
     async def instances(map_id: MapId = None, at: At = None) -> Response:
         """All instances."""
-        return await queries.hits(map_id, at, None, lambda gmap: gmap.find())
+        return await queries.answer(lambda gmap: _hits(gmap.find()), map_id, at)
 
     @app.get("/changes")
     async def changes(map_id: MapId = None, since: Since = None) -> Response:
         """What moved, came and went since an earlier visit, and what nobody looked at."""
-
-        def work(gmap: QueryMap) -> dict[str, Any]:
-            return {**gmap.changes_json("last" if since is None else since), **source(gmap)}
-
-        return JSONResponse(await queries.result(map_id, None, work))
+        visit = "last" if since is None else since
+        return await queries.answer(lambda gmap: gmap.changes_json(visit), map_id, None)
 
     @app.get("/instances/{id}")
     async def describe(number: Id, map_id: MapId = None, at: At = None) -> Response:
         """One instance."""
-
-        def work(gmap: QueryMap) -> dict[str, Any]:
-            return {**gmap.describe(number).to_json(), **source(gmap), **gmap.visits_json()}
-
-        return JSONResponse(await queries.result(map_id, at, work))
+        return await queries.answer(lambda gmap: gmap.describe(number).to_json(), map_id, at)
 
     @app.get("/instances/{id}/points", response_class=Response)
     async def points(

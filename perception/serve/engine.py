@@ -168,7 +168,7 @@ class QueryEngine:
                 except Exception as error:
                     _log.error("%s: not all of the new map can be served", self.path, exc_info=error)
                     self._unserved = f"{self.path}: not all of the map can be served ({_brief(error)})"
-            gc.collect()  # a map lies in circles of references: else maps pile up, as Python does not count their arrays
+            gc.collect()  # maps lie in circles of references, and would pile up: Python does not count arrays
             return True
 
     def _unreadable(self, error: Exception) -> InputError:
