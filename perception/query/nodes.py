@@ -76,7 +76,7 @@ class Nodes:
     def _ranker(self) -> Ranker:
         """Of the instances, then all nodes, so that their scores compare."""
         groups = [from_arrays(language)[0] for language in (self._gmap.language, *(k.language for k in self._kinds))]
-        return self._ranker_of_instances().over([description for group in groups for description in group])
+        return Ranker([description for group in groups for description in group], self._ranker_of_instances().encoder)
 
     def _scores(self, text: str) -> tuple[np.ndarray, np.ndarray]:
         """Scores of the instances, then all nodes, for a prompt, and their `evidence_of`."""

@@ -118,7 +118,7 @@ class QueryMap(Map):
         check_prompt(text, top_k, min_score)
         if not self.instances:
             return []
-        ranked, wanted = self._ranking.rank(text).hits, wanted_in_map(where, frame)
+        ranked, wanted = self._ranking.rank(text), wanted_in_map(where, frame)
         allowed = set(range(len(self.instances)) if where is None else self._fulfilling(wanted))
         found = self._nodes.fitting(text, ranked, wanted) if min_score is None else ranked
         chosen: list[Candidate] = [pair for pair in found if isinstance(pair[0], Node) or pair[0] in allowed]

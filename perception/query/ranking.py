@@ -71,17 +71,9 @@ LEAST_SPREAD = 1e-3  # of σ_tk, so that no text divides by zero
 NO_GAINS = np.zeros((2, 1))
 
 T = TypeVar("T")
+Ranking = list[tuple[int, float]]  # (index of the instance, score in [0, 1]), all instances, best first
 _quantiles = np.vectorize(NormalDist().inv_cdf, otypes=[float])
 """Φ⁻¹ of each number. SciPy has it too, but takes longer to import than a prompt to answer."""
-
-
-@dataclass(frozen=True)
-class Answer:
-    """hits: (index of the instance, score in [0, 1]), all instances, best first. present: whether any answers."""
-
-    text: str
-    hits: list[tuple[int, float]]
-    present: bool
 
 
 def answering(hits: Sequence[tuple[T, float]], min_score: float | None = None) -> list[tuple[T, float]]:
@@ -217,11 +209,10 @@ class Scorer:
         """Scores [I, K] of `shape_words.KINDS`; None if shapes are not available."""
         return None if self._measure_shapes is None else self._measure_shapes()
 
-    def rank(self, prompt: str, gains: np.ndarray = NO_GAINS) -> Answer:
+    def rank(self, prompt: str, gains: np.ndarray = NO_GAINS) -> Ranking:
         """Scores every instance for one prompt; see the module docstring. gains: of `scores`."""
         scores = self.scores(prompt, gains)
-        hits = [(int(i), float(scores[i])) for i in np.argsort(-scores, kind="stable")]
-        return Answer(check_texts([prompt])[0], hits, bool(answering(hits)))
+        return [(int(i), float(scores[i])) for i in np.argsort(-scores, kind="stable")]
 
     def scores(self, prompt: str, gains: np.ndarray = NO_GAINS) -> np.ndarray:
         """Scores [I] in [0, 1] of all instances for one prompt. gains [2, I]: what is added to z; how much less that is
@@ -354,10 +345,6 @@ class Ranker(Scorer):
             label_null=texts.label_null(label_rows),
         )
         super().__init__(texts, prepared, shapes, printed)
-
-    def over(self, descriptions: Sequence[InstanceDescription]) -> Ranker:
-        """A Ranker with the same encoder for other instances, without labels."""
-        return Ranker(descriptions, self.encoder)
 
 
 def probes() -> list[str]:

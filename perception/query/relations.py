@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from perception.language.negation import negation_in
 from perception.language.printed import found_after_a_word, quoted_text
 from perception.language.shapes import level_frame, ramp
 from perception.map.map import Map
-from perception.query.ranking import PRESENT, Answer, Scorer
+from perception.query.ranking import PRESENT, Ranking, Scorer
 
 TRIM = 0.02  # share of an instance's points left out of its box at either end of each axis
 WEIGHT = 3.0  # added to z for a full match, in standard deviations of the map's probes
@@ -72,7 +72,7 @@ def parse(prompt: str) -> Relation | None:
     return Relation(text[: match.start() - 1], kind, text[match.end() :])
 
 
-def ranked(ranker: Scorer, boxes: LevelBoxes | None, text: str) -> Answer:
+def ranked(ranker: Scorer, boxes: LevelBoxes | None, text: str) -> Ranking:
     """The ranking of the instances for a prompt, by the relation in it if there is one and z is known. InputError where
     the prompt says what a thing is not (`negation_in`)."""
     if wrong := negation_in(text):
@@ -80,8 +80,7 @@ def ranked(ranker: Scorer, boxes: LevelBoxes | None, text: str) -> Answer:
     relation = parse(text)
     if relation is None or boxes is None or quoted_text(text) is not None:
         return ranker.rank(text)
-    gains = gains_of(ranker, [(slice(None), boxes)], relation)
-    return replace(ranker.rank(relation.thing, gains), text=" ".join(text.split()))
+    return ranker.rank(relation.thing, gains_of(ranker, [(slice(None), boxes)], relation))
 
 
 def gains_of(ranker: Scorer, maps: Sequence[tuple[slice, LevelBoxes]], relation: Relation) -> np.ndarray:

@@ -62,13 +62,12 @@ def scene_graph(gmap: Map) -> networkx.DiGraph:
     """
     import networkx
 
-    boxes, level = LevelBoxes.of(gmap), level_from_map(gmap)
-    if boxes is None or level is None:
+    things = _level_things(gmap)
+    if things is None:
         advice = "map photos of a level camera, or a transforms.json with 'gravity'"
         raise InputError(f"{gmap.path}: which way is up is not known, and a scene graph needs it; {advice}")
-    held = holders(_level_points(gmap, level), boxes)
-    beside, rooms = boxes.match("beside"), _rooms(gmap)
-    shell = _shells(boxes)
+    held, boxes = holders(*things), things[1]
+    shell, beside, rooms = _shells(boxes), boxes.match("beside"), _rooms(gmap)
     ids = [int(entry["id"]) for entry in gmap.instances]
     graph = networkx.DiGraph(frame=gmap.frame, metric=gmap.metric, map_id=gmap.map_id)
     supports = {holder.position for holder in held if holder is not None and holder.relation == "on"}
@@ -101,16 +100,19 @@ def scene_graph(gmap: Map) -> networkx.DiGraph:
 def held_by(gmap: Map) -> dict[int, tuple[str, int]]:
     """What holds each instance that something holds, by its id: the relation and the other's id. {} where it is not
     known which way is up."""
-    boxes, level = LevelBoxes.of(gmap), level_from_map(gmap)
-    held = [] if boxes is None or level is None else holders(_level_points(gmap, level), boxes)
+    things = _level_things(gmap)
+    held = [] if things is None else holders(*things)
     ids = [int(entry["id"]) for entry in gmap.instances]
     return {i: (by.relation, ids[by.position]) for i, by in zip(ids, held, strict=False) if by is not None}
 
 
-def _level_points(gmap: Map, level: np.ndarray) -> list[np.ndarray]:
-    """At most MOST_POINTS points [P, 3] of each instance, z up."""
+def _level_things(gmap: Map) -> tuple[list[np.ndarray], LevelBoxes] | None:
+    """At most MOST_POINTS points [P, 3] of each instance, and their boxes, z up; None where up is not known."""
+    boxes, level = LevelBoxes.of(gmap), level_from_map(gmap)
+    if boxes is None or level is None:
+        return None
     clouds = [gmap.index.of(entry["id"]) for entry in gmap.instances]
-    return [cloud[:: -(-len(cloud) // MOST_POINTS) or 1].astype(np.float64) @ level.T for cloud in clouds]
+    return [cloud[:: -(-len(cloud) // MOST_POINTS) or 1].astype(np.float64) @ level.T for cloud in clouds], boxes
 
 
 def holders(points: list[np.ndarray], boxes: LevelBoxes) -> list[Holder | None]:

@@ -17,7 +17,7 @@ from perception.language.printed import Printed
 from perception.language.shapes import plane_normal, shape_scores
 from perception.machine import torch_on_one_thread
 from perception.map.map import Map
-from perception.query.ranking import Answer, Ranker
+from perception.query.ranking import Ranker, Ranking
 from perception.query.relations import LevelBoxes, ranked
 from perception.query.where import tidy
 
@@ -36,7 +36,7 @@ class TextRanking:
         self._made: Ranker | InputError | None = None
         self._remembered = lru_cache(REMEMBERED)(self._ranked)
 
-    def rank(self, text: str) -> Answer:
+    def rank(self, text: str) -> Ranking:
         """The ranking of `perception.query.ranking`. Without embeddings or encoder, the instances with this label.
 
         Raises InputError when the map has no embeddings or encoder and no instance has, or had, the label `text`.
@@ -44,22 +44,19 @@ class TextRanking:
         try:
             _ = self.ranker
         except InputError:
-            if (answer := self._by_label(text)) is not None:
-                return answer
-            if any(tidy(name or "") == tidy(text) for name in self._names):
-                return Answer(text, [], False)
+            named = self._by_label(text)
+            if named or any(tidy(name or "") == tidy(text) for name in self._names):
+                return named
             raise
         return self._remembered(" ".join(text.split()))
 
-    def _ranked(self, text: str) -> Answer:
+    def _ranked(self, text: str) -> Ranking:
         with torch_on_one_thread():
-            named = self._by_label(text) is not None
-            return self.ranker.rank(text) if named else ranked(self.ranker, self.boxes, text)
+            return self.ranker.rank(text) if self._by_label(text) else ranked(self.ranker, self.boxes, text)
 
-    def _by_label(self, text: str) -> Answer | None:
-        """The instances that the user labelled `text`, None without any. Needs no embeddings and no encoder."""
-        same = [n for n, e in enumerate(self._gmap.instances) if tidy(e.get("label") or "") == tidy(text)]
-        return Answer(text, [(n, 1.0) for n in same], True) if same else None
+    def _by_label(self, text: str) -> Ranking:
+        """The instances that the user labelled `text`. Needs no embeddings and no encoder."""
+        return [(n, 1.0) for n, e in enumerate(self._gmap.instances) if tidy(e.get("label") or "") == tidy(text)]
 
     @property
     def ranker(self) -> Ranker:

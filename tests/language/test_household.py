@@ -68,9 +68,9 @@ def test_of_two_alike_the_one_of_the_usual_size_is_the_mug() -> None:
     row = np.array([1, 0], np.float32)
     things = [InstanceDescription(row, row[None], np.zeros((24, 4), np.float32), ["a"], [(0, 0, 1, 1)])] * 2
     extents = np.array([[0.9, 0.9, 1.0], [0.1, 0.1, 0.1]])
-    assert [n for n, _ in Ranker(things, Same(), extents=extents).rank("red mug").hits] == [1, 0]
-    assert [n for n, _ in Ranker(things, Same(), extents=extents).rank("fridge").hits] == [0, 1]
-    assert [n for n, _ in Ranker(things, Same()).rank("red mug").hits] == [0, 1]
+    assert [n for n, _ in Ranker(things, Same(), extents=extents).rank("red mug")] == [1, 0]
+    assert [n for n, _ in Ranker(things, Same(), extents=extents).rank("fridge")] == [0, 1]
+    assert [n for n, _ in Ranker(things, Same()).rank("red mug")] == [0, 1]
 
 
 def test_sides_are_without_strays_and_thin_across_their_plane() -> None:

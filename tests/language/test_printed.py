@@ -19,7 +19,7 @@ from perception.language.base import unit_rows
 from perception.language.description import InstanceDescription
 from perception.language.ocr import Line, TextReader, make_reader
 from perception.language.printed import Printed, Texts, quoted_text
-from perception.query.ranking import Ranker
+from perception.query.ranking import Ranker, answering
 
 _WORDS = (
     "BIRDS CEREAL MILK BUTTER COFFEE TOMATO PEPPER SUGAR HONEY GARDEN "
@@ -185,11 +185,11 @@ def test_a_quoted_text_must_be_there() -> None:
     rows, palette = np.eye(8, dtype=np.float32)[1:3], np.zeros((24, 4), np.float32)
     things = [InstanceDescription(row, row[None], palette, ["0.jpg"], [(0, 0, 9, 9)]) for row in rows]
     ranker = Ranker(things, Boxes(), printed=Printed([_on("SALT"), _on("PEPPER")]))
-    assert ranker.rank("the box").hits[0][1] > 0.979  # 1 − LAPSE: nothing seen is certain
+    assert ranker.rank("the box")[0][1] > 0.979  # 1 − LAPSE: nothing seen is certain
     salt, pepper, sugar = (ranker.rank(f"the box that says {word}") for word in ("SALT", "PEPPER", "SUGAR"))
-    assert salt.present and salt.hits[0][0] == 0
-    assert not sugar.present and sugar.hits[0][0] == 0 and sugar.hits[0][1] == pytest.approx(0.49, abs=0.01)
-    assert not pepper.present or pepper.hits[0][0] == 1
+    assert answering(salt) and salt[0][0] == 0
+    assert not answering(sugar) and sugar[0][0] == 0 and sugar[0][1] == pytest.approx(0.49, abs=0.01)
+    assert not answering(pepper) or pepper[0][0] == 1
 
 
 def test_fusing_prefers_what_most_views_agree_on() -> None:

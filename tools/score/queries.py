@@ -24,7 +24,7 @@ from perception.bench.output import bench_parser
 from perception.errors import InputError
 from perception.language.shape_words import singular
 from perception.query import QueryMap, load_map
-from perception.query.ranking import Answer, Ranker, answering
+from perception.query.ranking import Ranker, Ranking, answering
 from perception.query.text_ranking import TextRanking
 from score.instances import read_scene, read_truth_cloud
 from score.reliability import SCORED, finish_reliability, parse_pairs
@@ -108,19 +108,19 @@ def true_objects(opened: QueryMap, scene: Path) -> list[int]:
 
 
 def _figures(
-    rank: Callable[[str], Answer], owners: list[int], queries: list[tuple[str, set[int]]], near: list[str]
+    rank: Callable[[str], Ranking], owners: list[int], queries: list[tuple[str, set[int]]], near: list[str]
 ) -> dict[str, Any]:
     right = [{n for n, owner in enumerate(owners) if owner in ids} for _, ids in queries]
     answers = [rank(text) for text, _ in queries]
-    found = [bool({i for i, _ in a.hits[:3]} & ids) for a, ids in zip(answers, right, strict=True)]
-    top1, top3 = accuracy([[i for i, _ in a.hits] for a in answers], right)
-    absent = [rank(t) for t in (*ABSENT, *near)]
-    wrong, wrong_near = ([a.text for a in absent if a.present and a.text in texts] for texts in (ABSENT, near))
+    found = [bool({i for i, _ in a[:3]} & ids) for a, ids in zip(answers, right, strict=True)]
+    top1, top3 = accuracy([[i for i, _ in a] for a in answers], right)
+    absent = {text: rank(text) for text in (*ABSENT, *near)}
+    wrong, wrong_near = ([text for text in texts if answering(absent[text])] for texts in (ABSENT, near))
     return {
         "top1": top1,
         "top3": top3,
-        "answered_present": round(float(np.mean([a.present for a in answers])), 3),
-        **returned([[owners[i] for i, _ in answering(a.hits)] for a in answers], [ids for _, ids in queries]),
+        "answered_present": round(float(np.mean([bool(answering(a)) for a in answers])), 3),
+        **returned([[owners[i] for i, _ in answering(a)] for a in answers], [ids for _, ids in queries]),
         "absent_prompts": len(ABSENT),
         "false_positives": round(len(wrong) / len(ABSENT), 3),
         "household_absent_prompts": len(near),
@@ -128,7 +128,9 @@ def _figures(
         "false_positive_prompts": wrong + wrong_near,
         "failed_prompts": [text for (text, _), f in zip(queries, found, strict=True) if not f],
         "unmapped_prompts": [text for (text, _), ids in zip(queries, right, strict=True) if not ids],
-        SCORED: [(a.hits[0][1], n < len(answers)) for n, a in enumerate(answers + absent)],
+        SCORED: [
+            (a[0][1], n < len(answers)) for n, a in enumerate([*answers, *(absent[text] for text in (*ABSENT, *near))])
+        ],
     }
 
 
