@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from array import array
 from dataclasses import dataclass
+from sys import intern
 from typing import Any
 
 import numpy as np
@@ -31,7 +33,7 @@ class Poses:
 
     def __init__(self) -> None:
         self.parents = dict[str, str]()
-        self._samples = dict[str, list[tuple[int, np.ndarray]]]()
+        self._samples: dict[str, tuple[array[int], array[float]]] = {}  # times and rows of the poses: may be millions
         self._static = set[str]()
         self.topics = dict[str, list[str]]()
         self._arrays = dict[str, tuple[np.ndarray, np.ndarray]]()
@@ -41,7 +43,9 @@ class Poses:
         parent, child = parent.lstrip("/"), child.lstrip("/")
         if self.parents.setdefault(child, parent) != parent:
             return
-        self._samples.setdefault(child, []).append((time, parent_from_child))
+        times, rows = self._samples.setdefault(child, (array("q"), array("d")))
+        times.append(time)
+        rows.extend(parent_from_child[:3].ravel())
         if static:
             self._static.add(child)
 
@@ -81,8 +85,10 @@ class Poses:
 
     def _at(self, child: str, time: int) -> np.ndarray | None:
         if child not in self._arrays:
-            samples = sorted(self._samples[child], key=lambda sample: sample[0])
-            self._arrays[child] = np.array([t for t, _ in samples]), np.stack([m for _, m in samples])
+            stamps, rows = (np.array(column) for column in self._samples.pop(child))
+            poses, order = np.tile(np.eye(4), (len(stamps), 1, 1)), np.argsort(stamps, kind="stable")
+            poses[:, :3] = rows.reshape(-1, 3, 4)[order]
+            self._arrays[child] = stamps[order], poses
         times, matrices = self._arrays[child]
         if child in self._static:
             return np.asarray(matrices[-1])
@@ -155,20 +161,22 @@ def _by_accelerometers(bag: Bag, poses: Poses, fixed: str) -> Down | None:
     An accelerometer at rest measures the acceleration that holds it up. Samples taken while moving slowly are rotated
     into the world by tf and averaged; the error is the spread of the means of BLOCKS stretches of time, and BIAS_DEG.
     """
-    samples = []
+    frames, times, pushes = list[str](), array("q"), array("d")  # millions in a long bag
     for one in bag.messages(bag.of_type(IMU)):
         message = one.message
         vectors = (message.linear_acceleration, message.angular_velocity)
         push, turn = (np.array([v.x, v.y, v.z], np.float64) for v in vectors)
         size = float(np.linalg.norm(push))
         if abs(size - G) < STILL_PUSH and not np.linalg.norm(turn) > STILL_TURN:  # a gyroscope may be absent: NaN
-            samples.append((str(message.header.frame_id), stamp_of(message) or one.time, push / size))
-    kept = np.unique(np.linspace(0, len(samples) - 1, min(len(samples), MOST_SAMPLES)).round().astype(int))
+            frames.append(intern(str(message.header.frame_id)))
+            times.append(stamp_of(message) or one.time)
+            pushes.extend(push / size)
+    kept = np.unique(np.linspace(0, len(times) - 1, min(len(times), MOST_SAMPLES)).round().astype(int))
     ups = []
-    for frame, time, push in (samples[index] for index in kept):
-        imu_from_world = poses.camera_from_world(fixed, frame, time)
+    for n in kept.tolist():
+        imu_from_world = poses.camera_from_world(fixed, frames[n], times[n])
         if imu_from_world is not None:
-            ups.append(imu_from_world[:3, :3].T @ push)
+            ups.append(imu_from_world[:3, :3].T @ pushes[3 * n : 3 * n + 3])
     if len(ups) < LEAST_SAMPLES:
         return None
     means = np.array([np.mean(block, axis=0) for block in np.array_split(np.array(ups), BLOCKS)])
