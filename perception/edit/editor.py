@@ -199,7 +199,9 @@ class Editor:
         if len(chosen) < 2:
             raise InputError(f"merge: found {len(chosen)} instance, expected at least 2; choose another one to join")
         rows = [self._present_row(instance) for instance in chosen]
-        new = self._next_id()
+        if not np.isin(self.ids, chosen).any():
+            raise InputError(f"merge: {', '.join(map(str, chosen))} have no Gaussians; choose others")
+        new = self._new_ids(1)
         ids = np.where(np.isin(self.ids, chosen), new, self.ids).astype(np.int32)
         entries = [self.instances[row] for row in rows]
         weights = np.array([entry["num_gaussians"] for entry in entries], np.float64)
@@ -224,7 +226,7 @@ class Editor:
         part = self._parts_of(entry, own)
         if part.max(initial=-1) < 1:
             raise InputError(f"instance {instance}: its Gaussians are all alike, there is nothing to split")
-        first = self._next_id()
+        first = self._new_ids(int(part.max()) + 1)
         ids = self.ids.copy()
         known, means = part >= 0, self.original.means[own]
         ids[own] = np.where(known, part, part[known][cKDTree(means[known]).query(means)[1]]) + first
@@ -304,9 +306,10 @@ class Editor:
         finer = InstanceConfig(min_cluster_size=max(8, len(rows) // 20), min_samples=8)
         return cluster_gaussians(gmap.means[rows], gmap.scales[rows], gmap.opacities[rows], gmap.features[rows], finer)
 
-    def _next_id(self) -> int:
-        if self._next > LARGEST:
-            raise InputError(f"{self.path}: has the id {LARGEST}, the largest; there is none left for another instance")
+    def _new_ids(self, count: int) -> int:
+        """The first of `count` new ids in a row."""
+        if self._next + count - 1 > LARGEST:
+            raise InputError(f"{self.path}: ids go up to {LARGEST}; there are not {count} left for other instances")
         return self._next
 
     def _entry(self, instance: int, ids: np.ndarray, score: float, views: int, label: Any = None) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import pytest
 
 from perception.edit.editor import Editor
 from perception.errors import InputError
+from perception.io.json_shapes import LARGEST
 from perception.language.colors import PALETTE
 from perception.language.description import InstanceDescription, to_arrays
 from perception.map.write import Map, read_map, set_labels, write_map
@@ -196,6 +197,27 @@ def with_parts(path: Path) -> Path:
     gmap.parts = {"ids": ids, **{f"language_{name}": a for name, a in to_arrays(said, "test").items()}}
     write_map(path, gmap)
     return path
+
+
+def test_a_split_needs_as_many_ids_as_parts(path: Path) -> None:
+    gmap = read_map(path)
+    gmap.info["next_id"] = LARGEST  # one is left
+    write_map(path, gmap)
+    editor = Editor(path)
+    with pytest.raises(InputError, match=f"ids go up to {LARGEST}"):
+        editor.split(2)
+    assert editor.merge([0, 1]) == LARGEST and not editor.ids.min() < -1
+
+
+def test_instances_without_gaussians_are_not_merged(path: Path) -> None:
+    gmap = read_map(path)
+    gmap.instance_ids = np.where(gmap.instance_ids < 2, -1, gmap.instance_ids).astype(np.int32)
+    gmap.instances = [{**entry, "num_gaussians": 60 * (entry["id"] == 2)} for entry in gmap.instances]
+    write_map(path, gmap)
+    editor = Editor(path)
+    with pytest.raises(InputError, match="0, 1 have no Gaussians"):
+        editor.merge([0, 1])
+    assert editor.merge([0, 2]) == 3 and editor.entry(3)["num_gaussians"] == 60
 
 
 def test_a_split_follows_the_hierarchy(path: Path) -> None:
