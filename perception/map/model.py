@@ -50,6 +50,8 @@ _TRAINING = {
     "iterations?": Count, "seconds?": Length, "pairs?": Length, "profile?": dict[str, Length], "decisions?": list[Text],
     "skipped_gradients?": Count,
 }  # fmt: skip
+_CORNER = Annotated[list[Number | None], Field(min_length=3, max_length=3)]
+_BLOCK = {"box": Annotated[list[_CORNER], Field(min_length=2, max_length=2)]}  # None: infinite
 _DEPTH_USE = typed({"views": Count, "measured": Share})
 _SCALE = typed({"metres_per_unit": Positive, "standard_error": Length | None, "source": PathText})
 _GRAVITY = typed({"direction": Direction, "standard_error_deg": Length, "source": PathText})
@@ -67,7 +69,8 @@ FACTS = typed({
     "masks?": {"warnings?": list[PathText]},
     "instances?": {"texts?": Any},
     "quality?": _QUALITY, "training?": _TRAINING, "seconds?": dict[str, Length], "peak_memory_mib?": Length,
-    "depth?": _DEPTH_USE | None, "scale?": _SCALE | None, "gravity?": _GRAVITY | None, "map_from_input?": Similarity,
+    "blocks?": [_BLOCK], "depth?": _DEPTH_USE | None, "scale?": _SCALE | None, "gravity?": _GRAVITY | None,
+    "map_from_input?": Similarity,
     "files?": dict[FileName, typed({"bytes": Bytes, "sha256": Text})],  # type: ignore[misc]
     "sha256?": Text, "views?": [VIEW], "visits?": [VISIT],
 })  # fmt: skip
