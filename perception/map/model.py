@@ -138,7 +138,8 @@ _LOOKS = {
 """Those of past.npz that say what things looked like; all or none."""
 
 
-def _check_arrays(arrays: Arrays, expected: dict[str, tuple[str, tuple[Any, ...]]], **sizes: int) -> None:
+def check_arrays(arrays: Arrays, expected: dict[str, tuple[str, tuple[Any, ...]]], **sizes: int) -> None:
+    """ValueError unless the arrays are there with these kinds and shapes, finite. sizes: of letters that are known."""
     for name, (kind, shape) in expected.items():
         if name not in arrays:
             raise ValueError(f"{name}: is missing")
@@ -154,7 +155,7 @@ def _check_arrays(arrays: Arrays, expected: dict[str, tuple[str, tuple[Any, ...]
 
 
 def _check_language(arrays: Arrays, rows: int) -> None:
-    _check_arrays(arrays, _LANGUAGE, I=rows)
+    check_arrays(arrays, _LANGUAGE, I=rows)
     counts, views = arrays["view_counts"], len(arrays["view_names"])
     if (counts < 0).any() or (counts > views).any() or counts.sum() != views:
         raise ValueError(f"view_counts: they are not the counts of {views} view_names")
@@ -168,7 +169,7 @@ def check_archive(name: str, arrays: Arrays, instances: list[dict[str, Any]], ga
     if name == "past":
         expected = {"means": ("f", ("M", 3)), "ids": ("i", ("M",)), "until": ("i", ("M",))}
         looks = _LOOKS if any(name in arrays for name in _LOOKS) else {}
-        _check_arrays(arrays, {**expected, **looks})
+        check_arrays(arrays, {**expected, **looks})
         spots = {(entry["id"], spot["until"]) for entry in instances for spot in entry.get("past", ())}
         for pair in zip(*(np.unique(np.stack([arrays["ids"], arrays["until"]]), axis=1).tolist()), strict=True):
             if pair not in spots:
@@ -179,11 +180,11 @@ def check_archive(name: str, arrays: Arrays, instances: list[dict[str, Any]], ga
     language = {key.removeprefix(PREFIX): array for key, array in arrays.items() if key.startswith(PREFIX)}
     if name == "parts":
         parts = [part["id"] for entry in instances for part in entry.get("parts", [])]
-        _check_arrays(arrays, {"ids": ("i", ("N",))}, N=gaussians)
+        check_arrays(arrays, {"ids": ("i", ("N",))}, N=gaussians)
         check_ids(arrays["ids"], parts)
         rows = len(parts)
     else:
-        _check_arrays(arrays, {"of": ("i", ("I",)), "scores": ("f", ("G",))}, I=len(instances))
+        check_arrays(arrays, {"of": ("i", ("I",)), "scores": ("f", ("G",))}, I=len(instances))
         rows = len(arrays["scores"])
         if set(np.unique(arrays["of"]).tolist()) - {-1} != set(range(rows)):
             raise ValueError(f"of: it does not number the groups of {rows} scores")

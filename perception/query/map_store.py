@@ -8,7 +8,6 @@ docs/formats.md lists its files. A file of maps/ holds what `indexing` prepares 
 from __future__ import annotations
 
 import hashlib
-import json
 from contextlib import AbstractContextManager
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -28,7 +27,7 @@ from perception.language.printed import Printed, quoted_text
 from perception.language.shape_words import KINDS
 from perception.machine import torch_on_one_thread
 from perception.map.checksums import STORE
-from perception.map.model import NAMES, STORED
+from perception.map.model import NAMES, STORED, check_arrays
 from perception.query.hit import Hit
 from perception.query.query_map import QueryMap
 from perception.query.ranking import Prepared, Scorer, TextEncoder, least_score
@@ -45,8 +44,17 @@ THING = np.dtype([("seen", "?"), ("null", "f8", 2), _COLORS, ("sides", "f8", 3),
 _BOX = (("center", "f8", 3), ("rotation", "f8", (3, 3)), ("extent", "f8", 3))
 RECORD = np.dtype([("id", "i8"), ("points", "i8"), ("centroid", "f8", 3), *_BOX, ("covariance", "f8", (3, 3))])
 """The fields of a hit; points: their number."""
-_RECORDS = {"things": THING, "told": RECORD}
-_RAGGED = ("label_rows", "label_null", "places", "poses", "names", "views")
+_RECORDS = {
+    "things": (THING, ("null", "colors")),
+    "told": (RECORD, ("centroid", "center", "rotation", "extent", "covariance")),
+}
+"""And the fields that are finite."""
+_ARRAYS = {
+    "things": ("u", ("I", THING.itemsize)), "told": ("u", ("I", RECORD.itemsize)), "plain": ("f", ("I", "P")),
+    "label_rows": ("f", ("L", "D")), "label_null": ("f", ("L", 2)), "names": ("u", ("N",)), "views": ("u", ("V",)),
+}  # fmt: skip
+_LEVEL = {"places": ("f", ("I", 2, 3)), "poses": ("f", ("C", 4, 4))}
+"""Of a map where up is known."""
 _TRIES = 5
 _OPENED = 8  # maps whose points are kept in memory
 _READ = 64  # maps whose names of views are kept as objects, 3 MB for 5000 instances; reading them takes 15 ms
@@ -75,7 +83,7 @@ class MapStore:
         self._encoder = facts["encoder"]
         self._chosen = lru_cache(REMEMBERED)(self._answering)
         self._opened = lru_cache(_OPENED)(QueryMap.open)
-        self._views = lru_cache(_READ)(lambda n: json.loads(self._maps.views[n].tobytes()))
+        self._views = lru_cache(_READ)(self._maps.views)
 
     def __getattr__(self, name: str) -> Any:
         if hasattr(QueryMap, name):
@@ -208,14 +216,14 @@ class MapStore:
 
 
 class _Maps:
-    """The files of a store's maps. entries: of store.json. slices, boxes, names, views: of each map; owner [I]: the map
-    of each instance, and records [I] its `RECORD`; instances follow each other map by map."""
+    """The files of a store's maps. entries: of store.json. slices, boxes, names: of each map; owner [I]: the map of
+    each instance, and records [I] its `RECORD`; instances follow each other map by map."""
 
     def __init__(self, path: Path, entries: list[dict[str, Any]]) -> None:
-        self.entries = entries
-        for entry in entries:  # before memory is taken for so many
-            file = path / "maps" / entry["file"]
-            with _reading(path / STORE):
+        self.entries, self._path = entries, path / STORE
+        self._files = [path / "maps" / entry["file"] for entry in entries]
+        for file, entry in zip(self._files, entries, strict=True):  # before memory is taken for so many
+            with _reading(self._path):
                 if file.is_file() and entry["instances"] * RECORD.itemsize > file.stat().st_size:
                     raise ValueError(f"maps: {file.name} is too small for its {entry['instances']} instances")
         counts = [entry["instances"] for entry in entries]
@@ -223,34 +231,49 @@ class _Maps:
         stops = np.cumsum(counts).tolist()
         self.slices = [slice(stop - count, stop) for stop, count in zip(stops, counts, strict=True)]
         self._rows: dict[str, np.ndarray] = {}
-        ragged: dict[str, list[Any]] = {name: [] for name in _RAGGED}
-        for own, entry in zip(self.slices, entries, strict=True):
-            file = path / "maps" / entry["file"]
+        self.names, self._views, self.boxes = list[Any](), list[np.ndarray](), list[LevelBoxes | None]()
+        labels = list[tuple[np.ndarray, np.ndarray]]()
+        for file, own, count in zip(self._files, self.slices, counts, strict=True):
             arrays = read_npz(file, file, "index its map again")
             with _reading(file):
-                for name, of_maps in ragged.items():
-                    of_maps.append(arrays.pop(name, None))
-                for name, array in arrays.items():
-                    if len(array) != entry["instances"]:
-                        raise ValueError(f"{name}: {len(array)} rows, {STORE} says {entry['instances']} instances")
+                level = _LEVEL if "places" in arrays else {}
+                parts = {name: ("f", ("I", name)) for name in arrays if name.startswith("part_")}
+                check_arrays(arrays, {**_ARRAYS, **level, **parts}, I=count)
+                for kind, (record, fields) in _RECORDS.items():
+                    arrays[kind] = arrays[kind].view(record)
+                    if not all(np.isfinite(arrays[kind][name]).all() for name in fields):
+                        raise ValueError(f"{kind}: NaN or infinity is among {', '.join(fields)}")
+                for name in (*_RECORDS, "plain", *parts):
                     if name not in self._rows:
-                        self._rows[name] = np.empty((sum(counts), *array.shape[1:]), array.dtype)
-                    self._rows[name][own] = array
-        with _reading(path / STORE):
-            self._things, self.records = (self._rows.pop(name).view(kind)[:, 0] for name, kind in _RECORDS.items())
-            self._label_rows, self._label_null = (np.concatenate(ragged[name]) for name in ("label_rows", "label_null"))
-            self.names = [parsed(names.tobytes()) for names in ragged["names"]]
-            for names, count in zip(self.names, counts, strict=True):
-                check(NAMES, names)
+                        self._rows[name] = np.empty((sum(counts), *arrays[name].shape[1:]), arrays[name].dtype)
+                    self._rows[name][own] = arrays[name]
+                check(NAMES, names := parsed(arrays["names"].tobytes()))
                 if not len(names["labels"]) == count == len(names["texts"] or names["labels"]):
                     raise ValueError(f"names: expected those of {count} instances")
-        self.views, poses = ragged["views"], ragged["poses"]
-        self.boxes = [
-            p if p is None else LevelBoxes(p[:, 0], p[:, 1], c) for p, c in zip(ragged["places"], poses, strict=True)
-        ]
+                self.names.append(names)
+                self._views.append(arrays["views"])
+                labels.append((arrays["label_rows"], arrays["label_null"]))
+                self.boxes.append(LevelBoxes(*arrays["places"].swapaxes(0, 1), arrays["poses"]) if level else None)
+        with _reading(self._path):
+            self._things, self.records = (self._rows.pop(name)[:, 0] for name in _RECORDS)
+            self._label_rows, self._label_null = (np.concatenate(each) for each in zip(*labels, strict=True))
+
+    def views(self, n: int) -> list[list[str]]:
+        """Of each instance of map n, the names of the photos that show it best, best first."""
+        with _reading(self._files[n]):
+            check(list[list[str]], names := parsed(self._views[n].tobytes()))
+            if len(names) != self.entries[n]["instances"]:
+                raise ValueError(f"views: expected those of {self.entries[n]['instances']} instances")
+        return names
 
     def scorer(self, encoder: TextEncoder) -> Scorer:
         """Of all instances, each with the scores that it has in its own map."""
+        lengths = {f"part_{n}": columns.stop - columns.start for n, (columns, _) in enumerate(encoder.parts)}
+        lengths["plain"] = encoder.encoder.dim if len(encoder.canonical) else 0
+        with _reading(self._path):
+            found = {name: self._rows[name].shape[1] for name in lengths}
+            if found != lengths or self._label_rows.shape[1] != encoder.encoder.dim:
+                raise ValueError(f"embeddings have lengths {found}, the encoder's {lengths}")
         texts = [text for names in self.names for text in names["texts"] or [[]] * len(names["labels"])]
         prepared = Prepared(
             **{name: self._things[name] for name in ("seen", "null", "colors", "sides")},

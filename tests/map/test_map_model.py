@@ -77,7 +77,7 @@ FACTS: list[tuple[tuple[Any, ...], Any, str]] = [
     (("scene", "origin"), [1, 2], "scene.origin"), (("quality", "views", "0.png", "psnr"), "x", "quality.views.0.png"),
     (("gravity", "direction"), [0, 0, 0], "gravity.direction"), (("scale", "source"), ..., "scale.source"),
     (("blocks",), 5, "blocks"), (("blocks",), [{}], "blocks[0].box"),
-    (("blocks",), [{"box": [[0, 0, 0]]}], "blocks[0].box"), (("blocks",), [{"box": [[0, "x", 0]] * 2}], "blocks[0].box"),
+    (("blocks",), [{"box": [[0, 0, 0]]}], "blocks[0].box"), (("blocks",), [{"box": [[0, "x", 0]] * 2}], "blocks"),
     (("map_from_input"), np.zeros((4, 4)).tolist(), "map_from_input"), (("files", "gaussians.ply"), 1, "files"),
     (("training", "seconds"), {}, "training.seconds"), (("seconds", "total"), None, "seconds.total"),
     (("peak_memory_mib",), "a", "peak_memory_mib"), (("seed",), -1, "seed"), (("other",), "@1e999", ""),

@@ -23,6 +23,7 @@ from perception.language.description import to_arrays
 from perception.map.write import Map, read_map, set_labels, write_map
 from perception.query import Where, load_map
 from perception.query.indexing import index_maps
+from perception.query.map_store import RECORD
 from perception.serve.engine import QueryEngine
 from support.query_maps import NAMES, HashEncoder, encoders, write_map_of
 from support.views_at import views_at
@@ -334,6 +335,30 @@ def test_damage_is_told_in_one_line(maps: list[Path], tmp_path: Path) -> None:
         files[0].write_text(json.dumps({**facts, **change}))
         with pytest.raises(InputError, match=r"store\.json"):
             load_map(tmp_path / "s", encoders)
+
+
+def test_a_file_of_a_store_that_fits_nothing_is_told_in_one_line(maps: list[Path], tmp_path: Path) -> None:
+    """Whole, but with other arrays than `indexing` writes: told at opening, at the first prompt or at the first hit."""
+    index_maps(tmp_path / "s", maps[1:2], encoders=encoders)
+    file = next((tmp_path / "s" / "maps").iterdir())
+    good = dict(np.load(file))
+
+    def told(name: str, array: np.ndarray | None) -> None:
+        changed = {**good, name: array}
+        np.savez(file, **{key: value for key, value in changed.items() if value is not None})
+        with pytest.raises(InputError, match="cannot be read as a store"):
+            load_map(tmp_path / "s", encoders).query("book next to the lamp", min_score=0.0)
+
+    for name, array in good.items():
+        told(name, array[..., None])
+        told(name, np.full(array.shape, "x"))
+        if name != "places":
+            told(name, None)
+    broken = good["told"].copy()
+    broken.view(RECORD)["centroid"] = np.nan
+    told("told", broken)
+    for name, value in (("views", 5), ("views", [[5]]), ("views", [["a"]]), ("names", {})):
+        told(name, np.frombuffer(json.dumps(value).encode(), np.uint8))
 
 
 def test_what_needs_one_map_says_so(store: Path) -> None:
