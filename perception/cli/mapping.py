@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from perception.cli.parser import command, map_command
+from perception.cli.parser import Parser, command, map_command
 from perception.errors import InputError
 from perception.interrupts import handled
 from perception.progress import Progress
@@ -60,21 +60,20 @@ def register(commands: Any) -> None:
 
 def _add_map(commands: Any) -> None:
     p = command(commands, "map", _map, "build a map of photos, a video, posed photos, RGB-D or a finished splat")
-    p.formatter_class, p.late_epilog = argparse.RawDescriptionHelpFormatter, _settings
     p.add_argument("input", type=Path, metavar="INPUT")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="MAP")
     p.add_argument("--preset", default="default", help="fast, default, quality or paper")
     _add_settings(p)
     _add_engine(p, "where blocks are trained")
     p = map_command(commands, "update", _update, "a map of today, from a map and the photos of a new visit")
-    p.formatter_class, p.late_epilog = argparse.RawDescriptionHelpFormatter, _settings
     p.add_argument("input", type=Path, metavar="INPUT", help="of the visit; photos without poses are localised")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="NEW")
     _add_settings(p)
 
 
-def _add_settings(p: argparse.ArgumentParser) -> None:
-    """The options of `map` and `update` for settings, and --resume."""
+def _add_settings(p: Parser) -> None:
+    """The options of `map` and `update` for settings, which their help lists, and --resume."""
+    p.formatter_class, p.late_epilog = argparse.RawDescriptionHelpFormatter, _settings
     p.add_argument("--config", type=Path, metavar="FILE.toml")
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
     p.add_argument(

@@ -81,7 +81,7 @@ def _mcp(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         host, _, port = args.http.rpartition(":")
         if not host:
             raise InputError(f"mcp: --http: found '{args.http}', expected HOST:PORT, such as 127.0.0.1:8766")
-        serve_http(args.map, _settings(args, host=host.strip("[]"), port=port), photos=args.photos)
+        serve_http(args.map, _settings(args, host=host.strip("[]"), port=port, photos=args.photos))
     return {}, ""
 
 

@@ -23,7 +23,7 @@ from perception.node.localise import Localising
 from perception.query import QueryMap
 from perception.serve.bodies import QueryBody, parse
 from perception.serve.engine import QueryEngine
-from perception.serve.requests import MAX_BYTES, EngineBusy, EngineClosed, Reply, Request, error_kind, error_line
+from perception.serve.requests import MAX_BYTES, EngineBusy, EngineClosed, Reply, Request, error_json, error_line
 
 _SHOWN = 80  # characters of a prompt in an error
 _LONGEST_ID = 200  # characters
@@ -65,15 +65,6 @@ def identity_of(data: str) -> str | None:
     except (ValueError, AttributeError, RecursionError):
         return None
     return identity if isinstance(identity, str) and len(identity) <= _LONGEST_ID else None
-
-
-def error_json(error: BaseException, text: str, identity: str | None) -> dict[str, Any]:
-    """The JSON that is sent instead of an answer; kind: see `error_kind`."""
-    return {
-        "id": identity,
-        "text": text if len(text) <= _SHOWN else text[:_SHOWN] + "…",
-        "error": {"kind": error_kind(error), "message": error_line(error)},
-    }
 
 
 Message = dict[str, Any]
@@ -139,10 +130,14 @@ class Core:
             self._transport.publish(topic, message)
         self._send_json(told)
 
+    def _refusal(self, error: BaseException, text: str, identity: str | None) -> Message:
+        """The JSON that is sent instead of an answer, which is counted."""
+        told = error_json(error)
+        self._refused[told["kind"]] += 1
+        return {"id": identity, "text": text if len(text) <= _SHOWN else text[:_SHOWN] + "…", "error": told}
+
     def _send_error(self, error: BaseException, text: str, identity: str | None) -> None:
-        body = error_json(error, text, identity)
-        self._refused[body["error"]["kind"]] += 1
-        self._send_json({**body, "stamp": answers.stamp_json(self._stamps.next())})
+        self._send_json({**self._refusal(error, text, identity), "stamp": answers.stamp_json(self._stamps.next())})
 
     def _send_json(self, value: Message, topic: answers.Channel = answers.ANSWER) -> None:
         self._transport.publish(topic, {"data": json.dumps(value, allow_nan=False)})
@@ -189,9 +184,7 @@ class Core:
         return answers.text_value(json.dumps(answers.answer_json(reply, question.identity), allow_nan=False))
 
     def _error_value(self, error: BaseException, name: str) -> Message:
-        body = error_json(error, name, identity_of(name))
-        self._refused[body["error"]["kind"]] += 1
-        return answers.text_value(json.dumps(body))
+        return answers.text_value(json.dumps(self._refusal(error, name, identity_of(name))))
 
     def reload(self) -> Message:
         """The reload service (std_srvs/Trigger): loads the map now at the path; on failure the current one stays."""

@@ -17,7 +17,7 @@ from perception.photos.camera_file import camera_info, lens_of
 from perception.query import QueryMap
 from perception.serve.engine import QueryEngine
 from perception.serve.localise import localised, pose_json, ros_covariance
-from perception.serve.requests import EngineBusy, EngineClosed, error_kind, error_line, source
+from perception.serve.requests import EngineBusy, EngineClosed, error_json, source
 from perception.types import Lens
 
 
@@ -50,7 +50,7 @@ class Localising:
             future = self._engine.run(lambda gmap: self._answer(gmap, message))
         except (EngineBusy, EngineClosed) as error:
             self._one.release()
-            self._send(message, {"error": {"kind": error_kind(error), "message": error_line(error)}})
+            self._send(message, {"error": error_json(error)})
         else:
             future.add_done_callback(lambda done: self._finish(message, done))
 
@@ -65,7 +65,7 @@ class Localising:
         self._one.release()
         error = done.exception()
         if error is not None:
-            self._send(message, {"error": {"kind": error_kind(error), "message": error_line(error)}})
+            self._send(message, {"error": error_json(error)})
             return
         gmap, answer = done.result()
         if isinstance(answer, Localised):

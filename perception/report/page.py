@@ -174,18 +174,19 @@ class _Album:
         """The number of the visit that took a view's photo; 0 for a name that is none of the map's."""
         return int(getattr(self.views.get(name), "visit", 0))
 
+    def _view(self, name: str) -> TrainingView:
+        assert (view := self.trained(name)) is not None  # see the class
+        return view
+
     def _camera(self, name: str) -> tuple[torch.Tensor, torch.Tensor, int, int]:
         """camera_from_world [4, 4], K [3, 3], width and height of a view's photo as it was trained."""
-        view = self.trained(name)
-        assert view is not None  # see the class
+        view = self._view(name)
         height, width = view.photo.shape[:2]
         return view.camera_from_world, view.K, width, height
 
     def render(self, name: str) -> np.ndarray:
         """[h, w, 3] uint8: the map rendered from the camera of the photo."""
-        view = self.trained(name)
-        assert view is not None  # see the class
-        return (render_view(self.gaussians, view) * 255 + 0.5).to(torch.uint8).numpy()
+        return (render_view(self.gaussians, self._view(name)) * 255 + 0.5).to(torch.uint8).numpy()
 
     def _ids(self, name: str) -> np.ndarray:
         """[h, w] instance ids rendered from the camera of the photo, −1 = none."""

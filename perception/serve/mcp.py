@@ -320,7 +320,7 @@ def serve_stdio(path: Path, encoders: Any = None, photos: Path | None = None) ->
             engine.close(wait=0)  # the client has gone
 
 
-def serve_http(path: Path, settings: ServeSettings, encoders: Any = None, photos: Path | None = None) -> None:
+def serve_http(path: Path, settings: ServeSettings, encoders: Any = None) -> None:
     """Serves the map at `path` over streamable HTTP until SIGINT or SIGTERM, with the checks of `serve`.
 
     No session is kept: each request is answered by itself, so a client may vanish at any time.
@@ -328,8 +328,8 @@ def serve_http(path: Path, settings: ServeSettings, encoders: Any = None, photos
     from perception.serve.guard import HttpGuard
 
     def build(engine: QueryEngine, settings: ServeSettings) -> Any:
-        server, host = make_server(engine, photos), settings.host
-        app = server.streamable_http_app(stateless_http=True, max_request_body_size=MAX_PICTURE, host=host)
+        server = make_server(engine, settings.photos)
+        app = server.streamable_http_app(stateless_http=True, max_request_body_size=MAX_PICTURE, host=settings.host)
         app.add_middleware(HttpGuard, settings=settings)
         return app
 

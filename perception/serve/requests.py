@@ -104,6 +104,11 @@ def error_line(error: BaseException | str) -> str:
     return " ".join(str(error).encode("utf-8", "backslashreplace").decode().split()) or type(error).__name__
 
 
+def error_json(error: BaseException) -> dict[str, str]:
+    """An error in the JSON of a message; HTTP has a status instead of the kind."""
+    return {"kind": error_kind(error), "message": error_line(error)}
+
+
 def source(gmap: QueryMap, frame: Frame | None = None) -> dict[str, Any]:
     """The facts of the map in every answer: the frame of its coordinates, whether they are metres (not in a frame that
     scales those of the map), the map's id. Frame and metres of a store's answer are None, and are given with each hit.
