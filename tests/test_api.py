@@ -96,7 +96,7 @@ def test_a_map_is_built(small_scene: Path, tmp_path: Path, monkeypatch: pytest.M
 
 def run_example(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In `folder`, with the names of its module; the encoder of the made maps stands in for that of the package."""
-    for module in ("query.text_ranking", "serve.engine", "query.map_store", "query.indexing"):
+    for module in ("serve.engine", "query.map_store", "query.indexing"):
         monkeypatch.setattr(f"perception.{module}.make_encoder", encoders)
     monkeypatch.chdir(folder)
     thing = named(name)

@@ -68,7 +68,7 @@ class MapStore:
     InputError when the store at `path` is damaged or of an unknown version.
     """
 
-    def __init__(self, path: Path, encoders: Encoders | None = None) -> None:
+    def __init__(self, path: Path, encoders: Encoders) -> None:
         self.path, self.encoders = path, encoders
         for left in reversed(range(_TRIES)):
             facts, raw = read_store(path)
@@ -144,7 +144,7 @@ class MapStore:
         """The scorer of all instances; InputError when the encoder cannot be made."""
         name, identity = self._encoder["name"], self._encoder["identity"]
         try:
-            encoder = (self.encoders or make_encoder)(name)
+            encoder = self.encoders(name)
         except InputError as error:
             raise InputError(f"{self.path / STORE}: encoder.name: {error}") from error
         if encoder is None:
@@ -317,6 +317,7 @@ def load_map(path: str | Path, encoders: Encoders | None = None) -> QueryMap:
     >>> gmap.query("red mug", top_k=3)[0].points.shape[1]
     3
     """
+    encoders = encoders or make_encoder
     if (Path(path) / STORE).is_file():
         return MapStore(Path(path), encoders)  # type: ignore[return-value]
     return QueryMap.open(Path(path), encoders=encoders)

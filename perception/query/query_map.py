@@ -14,6 +14,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.geometry import move_points, scale_of
 from perception.language.colors import COLOR_NAMES, color_share
+from perception.language.encoders import make_encoder
 from perception.map.history import Visit, changes_of, is_removed, last_seen, left, stood, visit_number, visits_of
 from perception.map.map import InstanceIndex, Map, build_index
 from perception.query.hit import Description, Hit, Neighbor
@@ -41,8 +42,7 @@ class QueryMap(Map):
     """A `Map` with queries. Thread-safe.
 
     Data is loaded on first use: embeddings and encoder at the first prompt. The map's folder may be replaced meanwhile:
-    this object keeps the map that it opened. encoders: makes an encoder from its name in the map's config;
-    perception.language.encoders.make_encoder when None.
+    this object keeps the map that it opened. encoders: makes an encoder from its name in the map's config.
 
     A method with `frame` takes and returns points, poses, boxes and lengths in that frame. Without it, they are in the
     map's own frame (`frame`), in metres when `metric`. Methods raise InputError for bad arguments and damaged files.
@@ -55,9 +55,10 @@ class QueryMap(Map):
     (2, True)
     """
 
-    encoders: Encoders | None = None
+    encoders: Encoders = make_encoder
 
     def __post_init__(self) -> None:
+        self.encoders = lru_cache(self.encoders)  # one for the scenes of all visits
         self._at = lru_cache(_VIEWS)(lambda visit: self._scene(visit, lambda entry: stood(entry, visit)))
         self._visit, self._today = self.newest_visit, self
         self._record: Map | None = None

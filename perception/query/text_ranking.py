@@ -12,7 +12,6 @@ from perception.errors import InputError
 from perception.frame.gravity import Gravity
 from perception.language.base import Encoder
 from perception.language.description import check_encoder, from_arrays
-from perception.language.encoders import make_encoder
 from perception.language.printed import Printed
 from perception.language.shapes import plane_normal, shape_scores
 from perception.machine import torch_on_one_thread
@@ -30,8 +29,8 @@ class TextRanking:
     """Ranks the instances of `gmap` for prompts; thread-safe. `encoders` makes an encoder from its name. names: labels
     that the user gave to other instances as well, which stood in the map once."""
 
-    def __init__(self, gmap: Map, encoders: Encoders | None, names: Sequence[str | None] = ()) -> None:
-        self._gmap, self._encoders, self._names = gmap, encoders or make_encoder, names
+    def __init__(self, gmap: Map, encoders: Encoders, names: Sequence[str | None] = ()) -> None:
+        self._gmap, self._encoders, self._names = gmap, encoders, names
         self._lock = threading.RLock()
         self._made: Ranker | InputError | None = None
         self._remembered = lru_cache(REMEMBERED)(self._ranked)

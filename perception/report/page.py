@@ -175,7 +175,8 @@ class _Album:
         return int(getattr(self.views.get(name), "visit", 0))
 
     def _view(self, name: str) -> TrainingView:
-        assert (view := self.trained(name)) is not None  # see the class
+        view = self.trained(name)
+        assert view is not None  # see the class
         return view
 
     def _camera(self, name: str) -> tuple[torch.Tensor, torch.Tensor, int, int]:

@@ -42,7 +42,7 @@ def world(kitchen: Path) -> Iterator[dict[str, Any]]:
     """The names after all Python snippets have run, a server at the port they speak of."""
     before = read_map(kitchen)
     patch = pytest.MonkeyPatch()
-    for module in ("query.text_ranking", "serve.engine", "query.map_store", "query.indexing"):
+    for module in ("serve.engine", "query.map_store", "query.indexing"):
         patch.setattr(f"perception.{module}.make_encoder", encoders)
     patch.chdir(kitchen.parent)
     names: dict[str, Any] = {"before": before}

@@ -377,7 +377,7 @@ def test_what_needs_one_map_says_so(store: Path) -> None:
 
 
 def test_the_commands(maps: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
-    for module in ("text_ranking", "map_store", "indexing"):
+    for module in ("map_store", "indexing"):
         monkeypatch.setattr(f"perception.query.{module}.make_encoder", encoders)
     store = str(tmp_path / "s")
 

@@ -69,6 +69,13 @@ def test_http_answers_with_what_is_there_and_names_what_is_gone(client: TestClie
     assert client.post("/query", json={"text": "mug", "at": 3}).status_code == 400
 
 
+def test_one_encoder_serves_the_scenes_of_all_visits(path: Path) -> None:
+    made: list[str] = []
+    gmap = load_map(path, lambda spec: made.append(spec) or encoders(spec))  # type: ignore[func-returns-value]
+    assert gmap.query("lamp") and gmap.gone("mug") and gmap.at(0).query("mug") and gmap.at(1).query("lamp")
+    assert made == ["hash"]
+
+
 def test_tools_of_language_models_say_it_too(engine: QueryEngine) -> None:
     pytest.importorskip("mcp", reason="the extra 'mcp' is not installed")
     from perception.serve.mcp import TOOLS

@@ -311,7 +311,7 @@ class MapJson:
             return ColorEncoder() if spec in ("conse", "auto") else encoders.make_encoder(spec)
 
         options = {"encoders": make, "progress": QUIET}
-        modules = ("query.text_ranking", "query.map_store", "query.indexing", "serve.engine")
+        modules = ("query.map_store", "query.indexing", "serve.engine")
         with contextlib.ExitStack() as stack:
             for module in modules:
                 stack.enter_context(patch(f"perception.{module}.make_encoder", make))
