@@ -12,6 +12,7 @@ from perception.errors import InputError
 from perception.frame.gravity import floor_height
 from perception.geometry import camera_centres, rotations, transform
 from perception.map.map import Map
+from perception.query.where import check_size
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1  # nav_msgs/OccupancyGrid
 OPAQUE, MOST_CELLS = 0.5, 16_000_000  # least opacity of a Gaussian that counts; largest grid
@@ -84,6 +85,5 @@ def floor_grid(gmap: Map, resolution: float, step: float = STEP) -> tuple[np.nda
     >>> sorted({int(value) for value in cells.ravel()}), map_from_grid.shape  # unknown, free, occupied
     ([-1, 0, 100], (4, 4))
     """
-    if not 0 < resolution < np.inf:
-        raise InputError(f"floor_grid: resolution is {resolution}, expected a positive number of metres")
+    check_size("floor_grid: resolution", resolution)
     return level_surface(gmap).grid(resolution, step)

@@ -65,7 +65,9 @@ def index_maps(
         for n, path in enumerate(paths, start=1):
             before = entries.get(str(path))
             try:
-                gmap = _opened(path, encoders)
+                if not (path / FACTS).is_file():
+                    raise InputError(f"{path}: is no map (no {FACTS} inside)")
+                gmap = QueryMap.open(path, encoders=encoders)
                 if before is None or before["map_id"] != gmap.map_id:
                     entries[str(path)] = _indexed(store, gmap, facts)
             except InputError as error:
@@ -86,12 +88,6 @@ def index_maps(
                 file.unlink(missing_ok=True)
     instances = sum(entry["instances"] for entry in entries.values())
     return {**counts, "maps": len(entries), "instances": instances, "left_out": left_out}
-
-
-def _opened(path: Path, encoders: Encoders) -> QueryMap:
-    if not (path / FACTS).is_file():
-        raise InputError(f"{path}: is no map (no {FACTS} inside)")
-    return QueryMap.open(path, encoders=encoders)
 
 
 def _facts(store: Path) -> dict[str, Any]:

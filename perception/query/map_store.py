@@ -78,6 +78,8 @@ class MapStore:
             except InputError:
                 if not left or read_store(path)[1] == raw:  # else it was replaced meanwhile
                     raise
+        self.maps = self._maps.entries
+        """The entries of its maps in store.json, sorted by path."""
         self.map_id = hashlib.sha256(raw).hexdigest()[:12]
         """Short identifier, which changes when any of the maps does."""
         self._encoder = facts["encoder"]
@@ -90,18 +92,8 @@ class MapStore:
             raise InputError(f"{self.path}: is a store of many maps, and this needs one map; give one of them")
         raise AttributeError(f"{type(self).__name__} has no attribute '{name}'")
 
-    @property
-    def maps(self) -> list[dict[str, Any]]:
-        """The entries of its maps in store.json, sorted by path."""
-        return self._maps.entries
-
-    @property
-    def frame(self) -> None:
-        """None: every hit is in the frame of its map."""
-
-    @property
-    def metric(self) -> None:
-        """None: every hit says whether its map is metric."""
+    frame = metric = None
+    """Every hit is in the frame of its map, and says whether that is metric."""
 
     @property
     def counts(self) -> dict[str, int]:
@@ -253,7 +245,8 @@ class _Maps:
                 self.names.append(names)
                 self._views.append(arrays["views"])
                 labels.append((arrays["label_rows"], arrays["label_null"]))
-                self.boxes.append(LevelBoxes(*arrays["places"].swapaxes(0, 1), arrays["poses"]) if level else None)
+                places = arrays.get("places")
+                self.boxes.append(None if places is None else LevelBoxes(places[:, 0], places[:, 1], arrays["poses"]))
         with _reading(self._path):
             self._things, self.records = (self._rows.pop(name)[:, 0] for name in _RECORDS)
             self._label_rows, self._label_null = (np.concatenate(each) for each in zip(*labels, strict=True))

@@ -13,6 +13,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.geometry import move_points, scale_of
+from perception.io.documents import brief
 from perception.language.colors import COLOR_NAMES, color_share
 from perception.language.encoders import make_encoder
 from perception.map.history import Visit, changes_of, is_removed, last_seen, left, stood, visit_number, visits_of
@@ -269,7 +270,10 @@ class QueryMap(Map):
 
     def position(self, instance_id: int) -> int:
         """The index of this id in instances.json; UnknownInstance when there is none."""
-        position = self._positions.get(instance_id)
+        try:
+            position = self._positions.get(instance_id)
+        except TypeError as error:  # a list, an array
+            raise UnknownInstance(f"instance: found {brief(instance_id)}, expected a number") from error
         if position is None:
             known = next((e for e in self.record.instances if e["id"] == instance_id), None)
             if known is not None:

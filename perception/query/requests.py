@@ -35,5 +35,5 @@ def check_prompt(text: Any, top_k: Any = TOP, min_score: Any = None) -> None:
         return
     if isinstance(min_score, bool) or not isinstance(min_score, (int, float, np.number)):
         raise InputError(f"query: min_score is {min_score!r}, expected a number or none")
-    if not np.isfinite(min_score):
+    if not -np.inf < min_score < np.inf:
         raise InputError(f"query: min_score is {min_score}, expected a finite number")

@@ -11,7 +11,7 @@ from perception.errors import InputError
 from perception.geometry import move_points, scale_of
 from perception.query.free_space import CELL
 from perception.query.query_map import QueryMap
-from perception.query.where import Frame
+from perception.query.where import Frame, check_size
 
 RAYS = 32  # points of an instance that are looked at
 MOST_CELLS, BATCH = 640, 64  # cells from which the rays are followed, and how many at a time
@@ -77,8 +77,7 @@ def where_to_stand(
     """
     lengths = {"radius": radius, "distance": distance, "within": within, "sensor_height": sensor_height}
     for name, value in lengths.items():
-        if not 0 < value < np.inf:
-            raise InputError(f"where_to_stand: {name} is {value}, expected a positive number of metres")
+        check_size(f"where_to_stand: {name}", value)
     gmap.position(instance_id)
     space, points = gmap.free_space, gmap.index.of(instance_id)
     points = move_points(np.linalg.inv(space.map_from_grid), points.astype(np.float64))

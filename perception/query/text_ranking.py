@@ -89,12 +89,10 @@ class TextRanking:
         return LevelBoxes.of(self._gmap)
 
     def _shapes(self) -> np.ndarray:
-        index = self._gmap.index
-        owners = np.repeat(index.ids, np.diff(index.starts))
-        poses = self._gmap.poses
-        gravity = self._gmap.info.get("gravity")
-        down = None if gravity is None else Gravity.from_json(gravity)
-        return shape_scores(index.points, owners, [entry["id"] for entry in self._gmap.instances], poses, down)
+        gmap, index = self._gmap, self._gmap.index
+        gravity = Gravity.from_json(gmap.info["gravity"]) if gmap.info.get("gravity") else None
+        owners, wanted = np.repeat(index.ids, np.diff(index.starts)), [entry["id"] for entry in gmap.instances]
+        return shape_scores(index.points, owners, wanted, gmap.poses, gravity)
 
 
 def encoder_name(gmap: Map) -> str:

@@ -117,6 +117,12 @@ def check_length(name: str, value: Any) -> None:
         raise InputError(f"{name} is {value}, expected a number of at least 0")
 
 
+def check_size(name: str, value: Any) -> None:
+    """InputError unless it is a number above 0."""
+    if not isinstance(value, (int, float, np.number)) or not 0 < value < np.inf:
+        raise InputError(f"{name} is {value!r:.80}, expected a positive number of metres")
+
+
 def position_of(point_or_pose: Any) -> np.ndarray:
     """[3] float64: a point as it is, or the origin of a pose [4, 4] (map_from_robot); InputError for other input."""
     array = numbers(point_or_pose, "near", "a point [3] or a pose [4, 4]")

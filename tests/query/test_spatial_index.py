@@ -12,6 +12,8 @@ import perception
 from perception.errors import InputError
 from perception.map.write import Map, read_map, set_labels, write_map
 from perception.query import Frame, QueryMap, Where, axis_box, load_map
+from perception.query.floor_grid import floor_grid
+from perception.query.robot_pose import where_to_stand
 from perception.types import OrientedBox
 from support.query_maps import NAMES, encoders, write_map_of
 from support.rotations import rotation_from_quaternion
@@ -225,6 +227,11 @@ def test_a_description_names_neighbours_by_their_gap(gmap: QueryMap, arrays: Map
     [
         lambda g: g.get(99),
         lambda g: g.describe(-1),
+        lambda g: g.get([1]),
+        lambda g: g.describe(np.arange(3)),
+        lambda g: where_to_stand(g, 0, radius="wide"),
+        lambda g: where_to_stand(g, 0, distance=0),
+        lambda g: floor_grid(g, None),
         lambda g: g.query(" "),
         lambda g: g.query("x" * 1_000_000),
         lambda g: g.query("mug \udcff"),  # as an argument of a command with a byte that is no UTF-8
