@@ -17,11 +17,12 @@ from perception.io.atomic import write_file
 Column = tuple[str, str, str]  # (column header, key in the row, format specification)
 
 
-def bench_parser(name: str, about: str | None) -> argparse.ArgumentParser:
-    """An argument parser with the options of all benchmarks: -o FOLDER and --json."""
-    parser = argparse.ArgumentParser(
-        prog=f"perception bench {name}", description=about, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def bench_parser(
+    name: str, about: str | None, kind: type[argparse.ArgumentParser] = argparse.ArgumentParser
+) -> argparse.ArgumentParser:
+    """An argument parser of this kind with the options of all benchmarks: -o FOLDER and --json."""
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = kind(prog=f"perception bench {name}", description=about, formatter_class=raw)
     folder = Path(f"bench-{name}")
     parser.add_argument("-o", "--output", type=Path, default=folder, metavar="DIR", help=f"for results ({folder})")
     parser.add_argument("--json", action="store_true", help="print one JSON object in place of the table")

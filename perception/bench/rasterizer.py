@@ -8,6 +8,7 @@ torch's current GPU, and gsplat on it where that is installed, with the square o
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
 import statistics
 import time
@@ -204,9 +205,9 @@ def _row(name: str, scene: dict[str, Any], case: Case, turns: list[Turn]) -> dic
     }  # fmt: skip
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Prints the table; JSON goes to the output folder."""
-    parser = bench_parser("rasterizer", __doc__)
+def main(arguments: Sequence[str] | None = None, kind: type[argparse.ArgumentParser] = argparse.ArgumentParser) -> None:
+    """Prints the table; JSON goes to the output folder. kind: of the parser of the arguments."""
+    parser = bench_parser("rasterizer", __doc__, kind)
     parser.add_argument("scenes", nargs="*", type=Path, help="splats .npz files; a synthetic scene when absent")
     parser.add_argument("--rounds", type=int, default=7, help="counted rounds, at least 1 (default 7)")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])

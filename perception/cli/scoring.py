@@ -41,5 +41,6 @@ def _eval_images(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 def _bench(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.bench import rasterizer
 
-    rasterizer.main(args.rest)
+    rasterizer.main([*args.rest, *(["--json"] if args.json else [])], Parser)
+    args.json = False  # it has printed its object
     return {}, ""

@@ -12,6 +12,7 @@ import torch
 import perception
 from perception.bench import rasterizer
 from perception.bench.rasterizer import load_scene, synthetic_scene
+from perception.cli import main
 from perception.errors import InputError
 
 
@@ -45,6 +46,17 @@ def test_of_a_scene_that_the_camera_does_not_see_all_figures_are_numbers(small, 
     rasterizer.main(["-o", str(tmp_path), *arguments])
     rows = json.loads(capsys.readouterr().out, parse_constant=lambda name: pytest.fail(name))["rows"]
     assert {row["gradient_error"] for row in rows} == {0} and {row["contributing_pairs"] for row in rows} == {0}
+
+
+def test_as_a_command_it_keeps_the_rules_of_commands(small, tmp_path, capsys):
+    """One object with --json, wherever that stands; one line for bad usage."""
+    few = ["-o", str(tmp_path), "--rounds", "1", "--threads", "1", "--dtypes", "float32"]
+    for words in (["--json", "rasterizer", *few], ["rasterizer", *few, "--json"]):
+        assert main(["bench", *words]) == 0
+        assert json.loads(capsys.readouterr().out)["rows"]
+    assert main(["bench", "rasterizer", "--rounds", "x"]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("error: ") and told.count("\n") == 1 and "--rounds" in told
 
 
 def test_a_file_that_holds_no_splats_is_named(tmp_path):
