@@ -47,11 +47,14 @@ class TextRanking:
             if named or any(tidy(name or "") == tidy(text) for name in self._names):
                 return named
             raise
-        return self._remembered(" ".join(text.split()))
+        rows, scores = self._remembered(" ".join(text.split()))
+        return list(zip(rows.tolist(), scores.tolist(), strict=True))
 
-    def _ranked(self, text: str) -> Ranking:
+    def _ranked(self, text: str) -> tuple[np.ndarray, np.ndarray]:
+        """The ranking as two arrays, which take a tenth of the memory: many prompts are remembered."""
         with torch_on_one_thread():
-            return self.ranker.rank(text) if self._by_label(text) else ranked(self.ranker, self.boxes, text)
+            hits = self.ranker.rank(text) if self._by_label(text) else ranked(self.ranker, self.boxes, text)
+        return np.array([row for row, _ in hits], np.int32), np.array([score for _, score in hits])
 
     def _by_label(self, text: str) -> Ranking:
         """The instances that the user labelled `text`. Needs no embeddings and no encoder."""

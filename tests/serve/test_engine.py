@@ -320,7 +320,9 @@ def test_memory_of_answers_is_let_go(path: Path) -> None:
     with engine_of(path) as engine:
         for number in range(400):
             engine.ask(Request(f"thing {number}", min_score=0.0))
-        assert engine.current._ranking._remembered.cache_info().currsize <= 256
+        ranking = engine.current._ranking
+        assert ranking._remembered.cache_info().currsize <= 256
+        assert sum(array.nbytes for array in ranking._remembered("thing 399")) <= 12 * len(NAMES)  # numbers, no objects
         assert np.array_equal(engine.ask("mug").hits[0].points, engine.current.get(0).points)
 
 
