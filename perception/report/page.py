@@ -31,7 +31,7 @@ from perception.map.map import MAX_SIDE, Map
 from perception.map.write import REPORT
 from perception.pictures import error_map, features_to_rgb, outline, overlay, titled_row
 from perception.progress import Progress
-from perception.query import QueryMap, load_map
+from perception.query import Hit, QueryMap, load_map
 from perception.query.crops import cut_out
 from perception.query.hit import printed_texts
 from perception.report.text import changes_parts, depth_figures, names_of
@@ -55,6 +55,7 @@ def write_own_report(path: Path, progress: Progress) -> dict[str, Any]:
 
 def write_map_report(opened: QueryMap, path: Path, queries: list[str]) -> Path:
     """The one-page report of a map, with the answers to `queries`; missing photos are left out."""
+    asked = [(text, opened.query(text)) for text in queries]  # first: one may be refused
     info, album = opened.info, _Album(opened)
     data = {
         "title": (opened.path or path).stem,
@@ -66,7 +67,7 @@ def write_map_report(opened: QueryMap, path: Path, queries: list[str]) -> Path:
         "changes": _changes(opened, album),
         "instances": _instance_rows(opened, album),
         "metric": opened.metric,
-        "queries": [_query_row(opened, text, album) for text in queries],
+        "queries": [_query_row(opened, text, hits, album) for text, hits in asked],
         "warnings": _warnings(info, album.scored),
         "settings": dict(flat(info.get("config", {}))),
     }
@@ -336,7 +337,6 @@ def _instance_rows(opened: QueryMap, album: _Album) -> list[dict[str, Any]]:
     ]
 
 
-def _query_row(opened: QueryMap, text: str, album: _Album) -> dict[str, Any]:
-    hits = opened.query(text)
+def _query_row(opened: QueryMap, text: str, hits: list[Hit], album: _Album) -> dict[str, Any]:
     picture = _best_picture(opened, opened.position(hits[0].instance_id), album, cropped=False) if hits else None
     return {"text": text, "hits": [(hit.instance_id, hit.score) for hit in hits], "picture": picture}

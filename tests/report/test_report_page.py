@@ -14,7 +14,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from perception.errors import InputError
+from perception.query import load_map
+from perception.report import page
 from perception.report.page import clock, write_page
+from support.query_maps import encoders, write_map_of
 
 NASTY = "<script>alert('x')</script> & \"quotes\""
 
@@ -118,6 +122,13 @@ def test_markup_in_names_is_shown_and_never_parsed(tmp_path: Path) -> None:
 def test_many_large_pictures_stay_under_the_limit(tmp_path: Path) -> None:
     path = write_page(tmp_path / "r.html", _full(480))
     assert path.stat().st_size < 3_000_000
+
+
+def test_a_refused_prompt_is_told_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page, "_Album", lambda gmap: pytest.fail("it renders already"))
+    opened = load_map(write_map_of(tmp_path / "a.gsmap", gaussians=100), encoders)
+    with pytest.raises(InputError, match="not or lacks"):
+        page.write_map_report(opened, tmp_path / "report.html", ["mug", "mug without a handle"])
 
 
 def test_times_read_well() -> None:
