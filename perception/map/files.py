@@ -150,7 +150,7 @@ _OF_PLY: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "means": _columns(["x", "y", "z"]),
     "quats": _columns([f"rot_{i}" for i in range(4)]),
     "log_scales": _columns([f"scale_{i}" for i in range(3)]),
-    "opacity_logits": lambda rows: np.ascontiguousarray(rows["opacity"], np.float32),
+    "opacity_logits": lambda rows: rows["opacity"].astype(np.float32),  # copied: a single one is not aligned
     "sh": _harmonics,
 }
 """Functions that compute fields of a map from the rows of gaussians.ply."""

@@ -219,3 +219,13 @@ def test_a_map_reads_a_field_once_and_keeps_what_it_is_given(path: Path) -> None
     assert Map.of(opened).means is opened.means and Map(means=opened.means).instances == []
     with pytest.raises(AttributeError, match="without quats"):
         _ = Map(means=opened.means).quats
+
+
+def test_a_map_of_one_gaussian_is_read_as_kernels_take_it(tmp_path: Path) -> None:
+    """Its only opacity lies where the PLY's header ends: a view of that is contiguous, and not aligned."""
+    one = np.ones((1, 3), np.float32)
+    quats, logits = np.float32([[1, 0, 0, 0]]), np.float32([2])
+    gmap = Map(one, quats, -one, logits, one[:, None], one, np.int32([-1]), np.float32([0]), [], {"frame": "map"}, [])
+    for length in range(8):  # of the header, modulo the size of a number
+        write_map(tmp_path / "a.gsmap", Map.of(gmap, sh=np.ones((1, 1 + length, 3), np.float32)))
+        assert as_gaussians(Map.open(tmp_path / "a.gsmap")).opacities.item() == pytest.approx(1 / (1 + np.exp(-2.0)))
