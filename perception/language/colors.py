@@ -8,7 +8,7 @@ by a few sRGB examples e. With d² = (LIGHTNESS ΔL*)² + Δa*² + Δb*² to the
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import dropwhile
 
 import numpy as np
@@ -69,9 +69,18 @@ _NOT_A_COLOR = {
 def color_words(text: str) -> list[str]:
     """Colour words of a text in canonical spelling, in order, without duplicates. "many" stands for multicoloured, and
     "not red" for what a thing is not to be."""
+    return list(dict.fromkeys(name for name, _ in _colors_said(text)))
+
+
+def denials(text: str) -> list[tuple[int, int]]:
+    """(start, end) of each "not " of a text that stands before a colour."""
+    return [span for _, span in _colors_said(text) if span is not None]
+
+
+def _colors_said(text: str) -> Iterator[tuple[str, tuple[int, int] | None]]:
+    """(colour word as of `color_words`, place of the "not " before it, if any) of each in a text."""
     found = list(_PATTERN.finditer(text))
     words = [match[0].lower() for match in found]
-    names: list[str] = []
     fruit, ruled_out = head_noun(text) == "orange", -2
     for n, word in enumerate(words):
         before, after = words[n - 1] if n else "", words[n + 1] if n + 1 < len(words) else ""
@@ -81,11 +90,11 @@ def color_words(text: str) -> list[str]:
             continue
         name = "many" if word in _MANY else _SYNONYMS.get(word, word)
         if name in _EXAMPLES or name == "many":
-            start = found[n].start()
-            if _NOT.search(text[max(0, start - 15) : start]) or (before == "or" and ruled_out == n - 2):
+            end = found[n].start()
+            denied = _NOT.search(text[:end], max(0, end - 15))
+            if denied or (before == "or" and ruled_out == n - 2):
                 name, ruled_out = f"{NOT}{name}", n
-            names.append(name)
-    return list(dict.fromkeys(names))
+            yield name, denied and denied.span()
 
 
 def without_color_words(text: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from perception.io.documents import brief
-from perception.language.colors import NOT, color_words
+from perception.language.colors import denials
 from perception.language.printed import quoted_text
 from perception.language.shape_words import head_noun
 
@@ -23,9 +23,10 @@ def negation_in(text: str) -> str | None:
     """The error of a prompt that says what a thing is not or lacks, beyond its colours, None of others: to encoders
     "mug", "no mug" and "mug without a handle" are alike. Quoted texts may say so, and names of signs."""
     quoted = quoted_text(text)
-    said = " ".join(text.split()) if quoted is None else quoted[0]
-    colors = sum(word.startswith(NOT) for word in color_words(said))
-    if len(_NOT.findall(said)) <= colors or head_noun(said) in _SIGNS:
+    said = rest = " ".join(text.split()) if quoted is None else quoted[0]
+    for start, end in denials(said):
+        rest = f"{rest[:start]}{' ' * (end - start)}{rest[end:]}"
+    if not _NOT.search(rest) or head_noun(said) in _SIGNS:
         return None
     found = 'says what a thing is not or lacks, which is understood of colours alone ("mug that is not red")'
     return f"query: {brief(text)} {found}; ask for what it is, and quote what is printed on it"

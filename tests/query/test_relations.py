@@ -49,6 +49,11 @@ def test_prompts_that_say_what_a_thing_is_not() -> None:
         *("everything except the mug", "anything but a mug", "mug neither on nor in the box", 'not "COKE"'),
         *("no mug that is not red", "mug that is not red and not on the table", "mug not in the red box"),
         *("mug without a handle", "desk with no mug", "mug that has no handle", "mug lacking a handle"),
+        *(
+            "not red or blue, not on the table",
+            "mug that is not red or blue and has no handle",
+            "non-red mug, not a bowl",
+        ),
         *("red mug without a handle", "Without the lamp", "desk without a red mug or a lamp that is not on it"),
     )
     answered = (
