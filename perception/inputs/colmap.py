@@ -64,7 +64,8 @@ def model_photos(folder: Path) -> list[Path]:
 
 def photo_folder(folder: Path, model: Path, names: Sequence[str]) -> Path:
     """The folder that holds most photos of a model: `images`, `input` (first for `distorted`) or the input itself where
-    one of them holds half, else any folder below. Some of the names are tried, LOOKED_AT at most."""
+    one of them holds half, else any folder below; if none is there and the input is a `sparse` or in one, those of the
+    folder that holds it. Some of the names are tried, LOOKED_AT at most."""
     names = names[:: -(-len(names) // LOOKED_AT) or 1]
     usual = [folder / name for name in _PHOTOS]
     usual = usual[::-1] if _DISTORTED in model.relative_to(folder).parts else usual
@@ -76,7 +77,9 @@ def photo_folder(folder: Path, model: Path, names: Sequence[str]) -> Path:
             best, most = path, held
         if held == len(names) or (path == folder and 2 * most >= len(names)):
             break
-    return best
+    here = folder.absolute()
+    above = next((path.parent for path in (here, here.parent) if path.name == _SPARSE), None)
+    return best if most or above is None else photo_folder(above, model.absolute(), names)
 
 
 def read_workspace(folder: Path, options: ReadOptions) -> Scene:
