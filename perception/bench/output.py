@@ -60,7 +60,7 @@ def finish(name: str, options: argparse.Namespace, report: dict[str, Any], text:
     from perception.tasks.folder import versions
 
     facts = {"bench": name, "arguments": dict(vars(options)), "machine": machine(), "versions": versions(), **report}
-    write_file(options.output / f"{name}.json", json.dumps(facts, indent=1, default=str), parents=True)
+    write_file(options.output / f"{name}.json", json.dumps(facts, indent=1, default=str))
     write_file(options.output / f"{name}.txt", text + "\n")
     print(json.dumps(facts, default=str) if options.json else text)
     print(f"kept in {options.output}: {name}.json, {name}.txt", file=sys.stderr)

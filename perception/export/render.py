@@ -46,8 +46,9 @@ def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[st
     components. cameras: a transforms.json in the coordinates of the map's input, or one of `localise`; None takes the
     map's held-out views (all views if none were held out). A camera with lens distortion is rendered with that
     distortion, so that the image aligns with its photo. InputError without views, for a name that points outside
-    `output`, and for an image that would replace a photo.
+    `output`, for an image that would replace a photo, and for a folder of photos, which a later map would be made of.
     """
+    what = [kind.strip() for kind in what]
     if wrong := [kind for kind in what if kind not in KINDS]:
         raise InputError(f"--what: found '{wrong[0]}', expected one of: {', '.join(KINDS)}")
     gmap = read_map(map_path)
@@ -62,7 +63,12 @@ def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[st
     folders = {kind: output if len(what) == 1 else output / kind for kind in what}
     listed = [] if cameras is None else [cameras.parent / name for name, _, _ in read_frames(cameras)]
     inputs = [map_path, cameras, *listed, *(photo.with_name(f"{photo.name}.png") for photo in listed)]
-    refuse_inputs((folder / file for folder in folders.values() for file in files), inputs)
+    outputs = [folder / file for folder in folders.values() for file in files]
+    refuse_inputs(outputs, inputs)
+    photos = [*listed, *(view.photo for view in gmap.views)]
+    if mixed := {file.parent.resolve() for file in outputs} & {photo.parent.resolve() for photo in photos}:
+        found = "holds photos, and a later map would be made of pictures of this one too"
+        raise InputError(f"{min(mixed)}: {found}; choose another -o")
     gaussians = as_gaussians(gmap)
     for kind, folder in folders.items():
         for file, view in zip(files, views, strict=True):
@@ -162,4 +168,4 @@ def write_picture(path: Path, image: np.ndarray) -> None:
     """Writes an image [H, W] or [H, W, 3] RGB; folders are made. InputError when that fails."""
     if image.ndim == 3:
         image = np.ascontiguousarray(image[..., ::-1])
-    write_file(path, cv2.imencode(".png", image)[1].tobytes(), parents=True)
+    write_file(path, cv2.imencode(".png", image)[1].tobytes())

@@ -36,7 +36,7 @@ Discard = Callable[[Path, Path], None]
 
 
 @contextmanager
-def atomic_file(path: str | Path, parents: bool = False) -> Iterator[Path]:
+def atomic_file(path: str | Path, parents: bool = True) -> Iterator[Path]:
     """Yields an empty temporary sibling to write; on success it is synced and renamed to `path`, else removed.
     parents: missing folders above it are made. InputError for every OSError: a full disk, missing rights or folders."""
 
@@ -49,7 +49,7 @@ def atomic_file(path: str | Path, parents: bool = False) -> Iterator[Path]:
         yield temporary
 
 
-def write_file(path: str | Path, content: str | bytes | Callable[[BinaryIO], object], parents: bool = False) -> None:
+def write_file(path: str | Path, content: str | bytes | Callable[[BinaryIO], object], parents: bool = True) -> None:
     """Writes a whole file as `atomic_file` does: a text in UTF-8, bytes, or what a function writes to the open file."""
     with atomic_file(path, parents) as new, new.open("wb") as file:
         if callable(content):

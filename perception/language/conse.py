@@ -155,5 +155,5 @@ def _cached(names: list[list[str]], encode: Any) -> np.ndarray:
     sizes = np.array([len(group) for group in names])
     classes = unit_rows(np.add.reduceat(embedded, np.cumsum(sizes) - sizes, axis=0) / sizes[:, None])
     with suppress(InputError):  # without a writable cache the embeddings are recomputed each time
-        write_file(path, lambda file: np.save(file, classes), parents=True)
+        write_file(path, lambda file: np.save(file, classes))
     return classes

@@ -20,7 +20,8 @@ MAP_FILES = (FACTS, EDITABLE, *DATA)
 
 
 def refuse_inputs(outputs: Iterable[Path | None], inputs: Iterable[Path | None]) -> None:
-    """InputError if a file to write is an input, a map's own or written twice: by its path, by links or by hard links.
+    """InputError if a file to write is an input, a map's own or written twice: by its path, by links or by hard links;
+    and where its folder does not allow it.
 
     outputs: files. inputs: files, and maps or stores, of which their own files and all that they were made from are
     meant. None is skipped.
@@ -32,6 +33,10 @@ def refuse_inputs(outputs: Iterable[Path | None], inputs: Iterable[Path | None])
     for output in (output for output in outputs if output is not None):
         if output.name in MAP_FILES and is_map(output.parent):
             raise InputError(f"{output}: is the name of a file of that map; write to another file")
+        folder = next(above for above in pointed(output).absolute().parents if os.path.lexists(above))
+        if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
+            why = "does not allow it" if folder.is_dir() else "is no folder"
+            raise InputError(f"{output}: cannot be written, as {folder} {why}; choose another path")
         for identity in _identities(output):
             if identity in read:
                 raise InputError(f"{output}: is {read[identity]}, which this command reads; write to another file")

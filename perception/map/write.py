@@ -121,8 +121,8 @@ def set_labels(path: Path, labels: dict[int, str | None]) -> dict[int, str | Non
                 raise InputError(f"{path}: has no instance {instance_id}; it has {len(places)}")
             files.instances[places[instance_id]]["label"] = label
         with contextlib.ExitStack() as both:  # both are written completely before the first rename
-            facts = both.enter_context(atomic_file(path / FACTS)) if "files" in files.facts else None
-            aside = both.enter_context(atomic_file(path / EDITABLE))
+            facts = both.enter_context(atomic_file(path / FACTS, parents=False)) if "files" in files.facts else None
+            aside = both.enter_context(atomic_file(path / EDITABLE, parents=False))
             _dump(aside, {"instances": files.instances})
             if facts is not None:  # other checksums are kept, so damage stays detectable
                 _dump(facts, seal({**files.facts, "files": {**files.facts["files"], EDITABLE: facts_of(aside)}}))
@@ -184,7 +184,7 @@ def relink(path: Path, folder: Path) -> dict[str, Any]:
             if view.name in found:
                 record = view_json(stored_view(view_from_json({**entry, "photo": str(found[view.name])}), path))
                 entry |= {key: record[key] for key in ("photo", "photo_beside", "photo_bytes")}
-        with atomic_file(path / FACTS) as aside:
+        with atomic_file(path / FACTS, parents=False) as aside:
             _dump(aside, seal(files.facts) if "files" in files.facts else files.facts)
     return {"linked": len(found), "missing": missing, "differ": differ}
 

@@ -45,7 +45,7 @@ def write_labels(file: Path, labels: np.ndarray, key: str = "") -> None:
     info = PngImagePlugin.PngInfo()
     info.add_text(_KEY, key)
     picture = Image.fromarray(labels.astype(np.uint16))
-    write_file(file, lambda new: picture.save(new, "PNG", compress_level=4, pnginfo=info), parents=True)
+    write_file(file, lambda new: picture.save(new, "PNG", compress_level=4, pnginfo=info))
 
 
 def stored_key(file: Path) -> str | None:

@@ -169,7 +169,7 @@ class FeatureCheckpoints:
 
 def save_checkpoint(path: Path, state: dict[str, Any], mark: str) -> None:
     """Writes `state` with the fingerprint `mark` of its settings, atomically."""
-    with atomic_file(path) as aside, aside.open("wb") as file:
+    with atomic_file(path, parents=False) as aside, aside.open("wb") as file:
         writer = _Writer(file)
         torch.save({"mark": mark, "state": state}, cast(BinaryIO, writer))
         if writer.error is not None:

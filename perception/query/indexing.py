@@ -131,7 +131,7 @@ def _indexed(store: Path, gmap: QueryMap, facts: dict[str, Any]) -> dict[str, An
     file = hashlib.sha256(key.encode()).hexdigest()[:32] + ".npz"
     if not (store / "maps" / file).is_file():
         arrays: dict[str, Any] = _arrays(gmap)
-        write_file(store / "maps" / file, lambda stream: np.savez(stream, **arrays), parents=True)
+        write_file(store / "maps" / file, lambda stream: np.savez(stream, **arrays))
     written = datetime.fromtimestamp((path / FACTS).stat().st_mtime, timezone.utc).isoformat(timespec="seconds")
     entry = {"map": str(path), "map_id": gmap.map_id, "frame": gmap.frame, "metric": gmap.metric, "written": written}
     return {**entry, "instances": len(gmap.instances), "file": file}

@@ -228,7 +228,7 @@ def write_graph(gmap: Map, path: Path) -> tuple[dict[str, Any], str]:
     import networkx
 
     graph = scene_graph(gmap)
-    write_file(path, json.dumps(networkx.node_link_data(graph, edges="edges"), indent=1), parents=True)
+    write_file(path, json.dumps(networkx.node_link_data(graph, edges="edges"), indent=1))
     kinds = Counter(kind for _, kind in graph.nodes(data="kind"))
     relations = Counter(relation for _, _, relation in graph.edges(data="relation"))
     counts = ", ".join(f"{count} {name}" for name, count in (*sorted(kinds.items()), *sorted(relations.items())))

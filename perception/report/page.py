@@ -91,7 +91,7 @@ def write_page(path: Path, data: Mapping[str, Any]) -> Path:
         page = text.encode(errors="replace")  # an unpaired surrogate in a file name cannot be encoded as UTF-8
         if len(page) < LIMIT:
             break
-    write_file(path, page, parents=True)
+    write_file(path, page)
     return path
 
 

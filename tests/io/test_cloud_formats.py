@@ -205,7 +205,8 @@ def test_a_header_that_promises_too_much_is_cut_short_not_out_of_memory(tmp_path
 def test_a_missing_file_and_a_folder_that_cannot_be_written(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         read_cloud(tmp_path / "none.ply")
+    write_cloud(tmp_path / "new" / "c.ply", sample())  # as a page, pictures and a graph, which make their folders
     with pytest.raises(InputError, match="cannot be written"):
-        write_cloud(tmp_path / "no" / "c.ply", sample())
+        write_cloud(tmp_path / "new" / "c.ply" / "c.ply", sample())
     with pytest.raises(InputError, match="cannot write the format"):
         write_cloud(tmp_path / "c.stl", sample())

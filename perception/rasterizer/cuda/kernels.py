@@ -120,7 +120,7 @@ def cached_kernels(options: KernelOptions, architecture: int) -> bytes:
         return file.read_bytes()
     cubin, _ = compile_kernels(nvrtc, options, architecture)
     with suppress(InputError):  # where the folder cannot be written, it is compiled again next time
-        write_file(file, cubin, parents=True)
+        write_file(file, cubin)
     return cubin
 
 
