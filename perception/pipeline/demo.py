@@ -16,6 +16,7 @@ from perception.config import load_config
 from perception.evaluate.instances import evaluate
 from perception.export.export_map import export_labels, write_export
 from perception.geometry import align_similarity, camera_centres
+from perception.language.encoders import make_encoder
 from perception.map.outputs import check_empty
 from perception.map.write import Map
 from perception.pipeline.mapping import build_map
@@ -58,6 +59,7 @@ class DemoTruth:
 def run_demo(output: Path, progress: Progress, seed: int = 0) -> tuple[dict[str, Any], str]:
     """Photos → SfM → masks → map → export → queries, all in `output`; returns figures and a text."""
     started = time.monotonic()
+    make_encoder("conse")  # InputError where the extra `demo` is not installed
     check_empty(output)
     photos, map_path = output / "photos", output / "demo.gsmap"
     shutil.copytree(SCENE / "photos", photos)

@@ -49,14 +49,16 @@ def log_estimate(source: Path, config: MapConfig, log: Callable[[str], None]) ->
     """Logs the estimate for the input `source` as one line; InputError if memory is not sufficient, or the photos
     are too small."""
     photos = photo_sizes(source)
+    check_size(photos, config.photos.max_side)
     if photos.sizes:
-        check_size(photos, config.photos.max_side)
         needed = check_memory(photos, config)
         log(f"{photos.what}, trained at up to {config.photos.max_side} pixels: about {needed / 2**30:.1f} GiB")
 
 
 def check_size(photos: PhotoSizes, max_side: int) -> None:
     """InputError where most photos would be trained with a side of less than WINDOW pixels, too small to be scored."""
+    if not photos.sizes:
+        return
     width, height = sorted(photos.sizes, key=lambda size: min(size) * min(1.0, max_side / max(size)))[
         len(photos.sizes) // 2
     ]

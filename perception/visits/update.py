@@ -25,6 +25,7 @@ from perception.changes.colours import in_grey
 from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.model import Nearby
+from perception.inputs.load import photo_sizes
 from perception.instances.group import Grouping
 from perception.language.base import Encoder
 from perception.language.ocr import make_reader
@@ -37,6 +38,7 @@ from perception.photos.decode import scaled_size
 from perception.photos.view_json import StoredView, moved_record, stored_view
 from perception.pipeline.changes import finished, hold_inputs
 from perception.pipeline.checkpoint import check_name, digest, fingerprint, working
+from perception.pipeline.estimate import check_size
 from perception.pipeline.instances import DescribedInstances, describe
 from perception.pipeline.optimise import Optimised, Run
 from perception.pipeline.record import finite, score_views
@@ -83,6 +85,7 @@ def update_map(
         masks = make_source(config.masks, config.sam)
         _refuse_other_masks(gmap, masks.name)
         encoder = _encoder_of(gmap, config.language.encoder)
+        check_size(photo_sizes(source), config.photos.max_side)
         visit = open_visit(run, gmap, masks, output)
         today = seen_today(visit)
         described = _described(visit, today, encoder)
