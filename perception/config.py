@@ -269,9 +269,11 @@ def load_config(
     preset: str = "default",
     given: Mapping[str, tuple[Any, str]] | None = None,
     folder: Path | None = None,
+    options: Mapping[str, tuple[Any, str]] | None = None,
 ) -> MapConfig:
-    """Defaults, overridden by the preset, `given` settings (see `settings_from`), the TOML file and KEY=VALUE pairs.
-    folder: that to which paths in settings are relative, None for the current one. InputError for the first error.
+    """Defaults, overridden by the preset, settings `given` as in `settings_from`, the TOML file, KEY=VALUE pairs, and
+    settings as `options` give them. folder: that to which paths in settings are relative, None for the current one.
+    InputError for the first error.
 
     >>> config = load_config(pairs=["train.iterations=500", "masks=labels:labels"], preset="fast")
     >>> config.train.iterations, config.train.effort, config.masks
@@ -283,13 +285,14 @@ def load_config(
     if file is not None:
         given |= {key: (value, str(file)) for key, value in flat(read_toml(file))}
     given |= {key: (text, "--set") for key, text in read_pairs(pairs or []).items()}
-    return settings_from(MapConfig, given, folder)
+    return settings_from(MapConfig, given | dict(options or {}), folder)
 
 
 def settings_from(
     model: type[AnySettings], given: Mapping[str, tuple[Any, str]], folder: Path | None = None
 ) -> AnySettings:
-    """The model with the given settings: dotted key -> (value, where it was read). folder: as of `load_config`.
+    """The model with the given settings: dotted key -> (value, where it was read: --set, --preset, a file, or the
+    option of this setting alone). folder: as of `load_config`.
 
     Raises InputError with key, value and range for the first setting that is unknown, of another type or out of range.
     """
@@ -306,7 +309,8 @@ def settings_from(
         first = error.errors(include_url=False, include_context=False)[0]
         key = next(key for key in known if key.split(".") == list(first["loc"])[: key.count(".") + 1])
         value, where = given[key]
-        raise InputError(f"{where} {key}: found {_short(value)}, expected {expected(known[key])}") from None
+        what = where if where.startswith("--") and where not in ("--set", "--preset") else f"{where} {key}"
+        raise InputError(f"{what}: found {_short(value)}, expected {expected(known[key])}") from None
 
 
 def fields(model: type[Settings]) -> Iterator[tuple[str, FieldInfo]]:

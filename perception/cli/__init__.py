@@ -35,11 +35,16 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _resume(argv: Sequence[str] | None) -> str:
-    """The command that continues the interrupted one; `map` and `update` need --resume for that."""
+_KEEPING = (["map"], ["update"], ["fleet"], ["index"], ["models"])
+"""Commands that go on with what an interrupted run has made; the first two with --resume."""
+
+
+def _interrupted(argv: Sequence[str] | None) -> str:
+    """What to do after Ctrl-C."""
     arguments = [str(argument) for argument in (sys.argv[1:] if argv is None else argv)]
-    more = ["--resume"] if arguments[:1] in (["map"], ["update"]) and "--resume" not in arguments else []
-    return shlex.join(["perception", *arguments, *more])
+    more = ["--resume"] if arguments[:1] in _KEEPING[:2] and "--resume" not in arguments else []
+    kept = "what was done is kept, go on with" if arguments[:1] in _KEEPING else "nothing is kept, begin again with"
+    return f"interrupted; {kept}: {shlex.join(['perception', *arguments, *more])}"
 
 
 def _warn(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
@@ -63,8 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except InputError as error:
         return _refused(error)
     except KeyboardInterrupt:
-        message = f"interrupted; what was done is kept, go on with: {_resume(argv)}"
-        print(getattr(args, "interrupted", message), file=sys.stderr)
+        print(getattr(args, "interrupted", _interrupted(argv)), file=sys.stderr)
         return 130
     except BrokenPipeError:
         return 0

@@ -83,7 +83,7 @@ def _add_settings(p: Parser) -> None:
         "--keep-world", action=argparse.BooleanOptionalAction, help="keep the input's frame (default: if it has poses)"
     )
     for key, (metavar, text) in _SHORTCUTS.items():
-        p.add_argument(f"--{key.rpartition('.')[2].replace('_', '-')}", metavar=metavar, help=text, dest=key)
+        p.add_argument(_option(key), metavar=metavar, help=text, dest=key)
     p.add_argument("--resume", action="store_true", help="go on with an interrupted run")
 
 
@@ -131,17 +131,21 @@ _SHORTCUTS = {
 """Settings with an option of their own: the last part of their name."""
 
 
-def settings_given(args: argparse.Namespace) -> list[str]:
-    """KEY=VALUE of every setting on the command line, those of --set first."""
+def _option(key: str) -> str:
+    return f"--{key.rpartition('.')[2].replace('_', '-')}"
+
+
+def settings_given(args: argparse.Namespace) -> dict[str, tuple[Any, str]]:
+    """Key -> (value, option) of every setting that is given by an option of its own."""
     values = {key: getattr(args, key) for key in _SHORTCUTS}
     values |= {"photos.strict": args.strict, "frame.keep_world": args.keep_world}
-    return args.pairs + [f"{key}={value}" for key, value in values.items() if value is not None]
+    return {key: (value, _option(key)) for key, value in values.items() if value is not None}
 
 
 def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.config import load_config
 
-    config = load_config(args.config, settings_given(args), args.preset)
+    config = load_config(args.config, args.pairs, args.preset, options=settings_given(args))
     from perception.pipeline.mapping import build_map
     from perception.report.page import write_own_report
     from perception.report.text import map_facts
@@ -162,7 +166,7 @@ def _update(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.visits.update import update_map
 
     refuse_inputs([args.output], [args.map])
-    config = update_settings(args.map, args.config, settings_given(args))
+    config = update_settings(args.map, args.config, args.pairs, settings_given(args))
     with _sigterm_as_interrupt(), Progress() as progress:
         update_map(args.map, args.input, args.output, config, resume=args.resume, progress=progress)
         info = write_own_report(args.output, progress)

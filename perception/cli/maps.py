@@ -94,6 +94,8 @@ def _query(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.report.text import names_of, query_text, write_hits
 
     refuse_inputs([args.points], [args.map])
+    if args.min_score is not None and args.min_score > 1:
+        raise InputError(f"--min-score: found {args.min_score:g}, expected a probability, at most 1")
     opened = load_map(args.map)
     opened = opened if args.at is None else opened.at(args.at)
     ways = (opened.query, opened.gone)

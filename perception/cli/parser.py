@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -22,6 +23,17 @@ class Parser(argparse.ArgumentParser):
         self.register("type", Path, _path)
         self._negative_number_matcher = re.compile(r"-([\d.]|[xyz]$)")  # no options: -1, and -y or -0.1,-0.9,0 of --up
 
+    def parse_known_args(self, *args: Any, **kwargs: Any) -> Any:  # type: ignore[override]
+        """As argparse, but a subcommand itself refuses what it does not know."""
+        given, unknown = super().parse_known_args(*args, **kwargs)
+        if unknown:
+            near = difflib.get_close_matches(unknown[0], self._option_string_actions, 1)
+            advice = f", did you mean {near[0]}?" if near else ""
+            if not unknown[0].startswith("-"):
+                advice = "; options stand after all other arguments, and a text with blanks in quotes"
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{advice}")
+        return given, unknown
+
     def error(self, message: str) -> Any:  # type: ignore[override]
         raise InputError(f"{self.prog}: {message} (see {self.prog} --help)")
 
@@ -33,6 +45,8 @@ class Parser(argparse.ArgumentParser):
 
 def _path(text: str) -> Path:
     try:
+        if not text.strip():
+            raise InputError("found an empty text, expected a path; is a variable of the shell not set?")
         path = local_path(text)
         return path if path.name else path.absolute()  # a map that is written anew takes the working folder's name
     except InputError as error:

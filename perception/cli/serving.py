@@ -53,13 +53,17 @@ def _folder(text: str) -> Path:
     return Path(text)
 
 
+_OF_HTTP = dict.fromkeys(("host", "port"), "--http")
+
+
 def _settings(args: argparse.Namespace, **given: Any) -> Any:
     from perception.config import settings_from
     from perception.serve.listening import read_token
     from perception.serve.requests import ServeSettings
 
     given["token"] = None if args.token_file is None else read_token(args.token_file)
-    return settings_from(ServeSettings, {name: (value, args.command) for name, value in given.items()})
+    options = {"queue_size": "--queue", "token": "--token-file"} | ({} if args.command == "serve" else _OF_HTTP)
+    return settings_from(ServeSettings, {name: (v, options.get(name, f"--{name}")) for name, v in given.items()})
 
 
 def _serve(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

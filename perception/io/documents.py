@@ -61,6 +61,8 @@ def brief(value: object, most: int = 120) -> str:
     import reprlib
 
     text = str(value) if isinstance(value, BaseException) else reprlib.repr(value)
+    if isinstance(value, OSError) and value.strerror:  # without the number and the path
+        text = value.strerror
     return " ".join(text.split())[:most] or type(value).__name__
 
 

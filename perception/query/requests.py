@@ -30,7 +30,9 @@ def check_prompt(text: Any, top_k: Any = TOP, min_score: Any = None) -> None:
     if isinstance(top_k, bool) or not isinstance(top_k, (int, np.integer)):
         raise InputError(f"query: top_k is {top_k!r}, expected a whole number")
     if not 1 <= top_k <= MAX_TOP:
-        raise InputError(f"query: top_k is {top_k}, expected at least 1 and at most {MAX_TOP}")
+        raise InputError(
+            f"query: the number of hits (top_k, --top) is {top_k}, expected at least 1 and at most {MAX_TOP}"
+        )
     if min_score is None:
         return
     if isinstance(min_score, bool) or not isinstance(min_score, (int, float, np.number)):

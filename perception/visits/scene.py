@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -48,11 +49,14 @@ OTHER_UNIT = 1.5
 """Factor between measured depths and the map's from which the visit is in another unit."""
 
 
-def update_settings(path: Path, file: Path | None, pairs: list[str]) -> MapConfig:
-    """The settings that the map at `path` was made with, but for those of its own input, overridden by the TOML file
-    and KEY=VALUE pairs. InputError for the first error, for one without effect, and where masks have to be given."""
+def update_settings(
+    path: Path, file: Path | None, pairs: list[str], options: Mapping[str, tuple[Any, str]] | None = None
+) -> MapConfig:
+    """The settings that the map at `path` was made with, but for those of its own input, overridden by the TOML file,
+    KEY=VALUE pairs and options, as of `load_config`. InputError for the first error, for one without effect, and where
+    masks have to be given."""
     settings = {} if file is None else {key: f"{file} {key}" for key, _ in flat(read_toml(file))}
-    settings |= {key: key for key in read_pairs(pairs)}
+    settings |= {key: key for key in read_pairs(pairs)} | {key: where for key, (_, where) in (options or {}).items()}
     if unused := next((where for key, where in settings.items() if key.startswith(OF_MAP)), None):
         what = "has no effect on an update, which keeps the frame and the unit of its map"
         raise InputError(f"{unused}: {what}; leave it out (perception scale changes the unit of a map)")
@@ -61,7 +65,7 @@ def update_settings(path: Path, file: Path | None, pairs: list[str]) -> MapConfi
     own = {key: value for key, value in before.items() if key in known and not key.startswith(OF_INPUT)}
     labels = str(own.get("masks", "")).startswith("labels:")
     given = {key: (value, str(path / "map.json")) for key, value in own.items() if not (labels and key == "masks")}
-    config = load_config(file, pairs, given=given)
+    config = load_config(file, pairs, given=given, options=options)
     if labels and not config.masks.startswith("labels:"):
         raise InputError(f"--masks: {path} was made with {own['masks']}; give labels:DIR with those of the new photos")
     return config
