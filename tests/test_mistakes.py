@@ -47,7 +47,7 @@ def gmap(tmp_path: Path) -> Path:
         ("query m mug --top 3 cup", "perception query: unrecognized arguments: cup; options stand after all other"),
         ("scale m --tag-size 5cm", "--tag-size: found '5cm', expected a number above 0 to 1000"),
         ("serve m --queue 0", "--queue: found 0, expected a whole number from 1"),
-        ("mcp m --http 127.0.0.1:99999", "--http: found '99999', expected a whole number from 0 to 65535"),
+        ("mcp m --http 127.0.0.1:99999", "--http port: found '99999', expected a whole number from 0 to 65535"),
         ("query m mug --min-score 80", "--min-score: found 80, expected a probability, at most 1"),
     ],
 )

@@ -53,17 +53,15 @@ def _folder(text: str) -> Path:
     return Path(text)
 
 
-_OF_HTTP = dict.fromkeys(("host", "port"), "--http")
-
-
 def _settings(args: argparse.Namespace, **given: Any) -> Any:
     from perception.config import settings_from
     from perception.serve.listening import read_token
     from perception.serve.requests import ServeSettings
 
     given["token"] = None if args.token_file is None else read_token(args.token_file)
-    options = {"queue_size": "--queue", "token": "--token-file"} | ({} if args.command == "serve" else _OF_HTTP)
-    return settings_from(ServeSettings, {name: (v, options.get(name, f"--{name}")) for name, v in given.items()})
+    options = {name: f"--{name}" if args.command == "serve" else f"--http {name}" for name in given}
+    options |= {"queue_size": "--queue", "token": "--token-file"}
+    return settings_from(ServeSettings, {name: (value, options[name]) for name, value in given.items()})
 
 
 def _serve(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
