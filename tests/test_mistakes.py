@@ -135,6 +135,32 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_work(
         refuse_inputs([tmp_path / "out.ply"], [])
 
 
+@pytest.mark.parametrize(
+    ("option", "names", "line"),
+    [
+        ("--ignore-masks", [], "holds no PNG; expected a PNG of the same stem for each, such as a.png"),
+        (
+            "--ignore-masks",
+            ["c"],
+            "none of its 1 PNG files is named as a photo; expected a PNG of the same stem for each",
+        ),
+        ("--masks", ["mask_a", "c"], "none of its 2 PNG files is named as a photo"),
+    ],
+)
+def test_masks_of_other_photos_are_refused_before_poses_are_looked_for(
+    option: str, names: list[str], line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photo(tmp_path / "photos/a.jpg")
+    photo(tmp_path / "photos/b.jpg")
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for name in names:
+        photo(masks / f"{name}.png")
+    value = f"labels:{masks}" if option == "--masks" else masks
+    assert f"{masks}: {line}" in told(capsys, "map", tmp_path / "photos", "-o", tmp_path / "m.gsmap", option, value)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["masks", "photos"]
+
+
 @pytest.mark.parametrize("given", ["sparse", "sparse/0"])
 def test_the_photos_of_a_model_lie_beside_its_sparse(tmp_path: Path, given: str) -> None:
     """docs/formats.md: "give that folder alone", of several models."""

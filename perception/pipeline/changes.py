@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 from perception.config import MapConfig
@@ -24,6 +24,7 @@ from perception.masks.sam_models import sam_graphs
 from perception.onnx.sessions import side_files
 from perception.onnx.store import resolve
 from perception.photos.folder import list_photos
+from perception.photos.named_files import folded
 from perception.pipeline.checkpoint import INPUTS, clear_work, frames_folder, work_folder
 from perception.progress import Progress
 
@@ -112,6 +113,22 @@ def hold_inputs(work: Path, source: Path, config: MapConfig, output: Path) -> In
     _compare(work, {key: before[key] for key in both}, {key: now[key] for key in both}, "since this run began", todo)
     write_file(file, json.dumps({**before, **now}))
     return now
+
+
+def refuse_unnamed(inputs: Inputs, config: MapConfig) -> None:
+    """InputError where a folder of masks or of label images holds no PNG that is named as a photo."""
+    photos = sorted(name for key, names in inputs.items() if key.startswith(("input=", "frames=")) for name in names)
+    stems = {folded(PurePath(name).stem) for name in photos}
+    if len(photos) < 2:  # a video, or a finished splat, whose frames are not there yet
+        return
+    folders = ["photos.ignore_masks", *(["masks"] if config.masks.startswith("labels:") else [])]
+    for key, files in inputs.items():
+        setting, _, folder = key.partition("=")
+        named = ({folded(PurePath(name).stem), folded(PurePath(PurePath(name).stem).stem)} for name in files)
+        if setting in folders and Path(folder).is_dir() and not any(stems & either for either in named):
+            such = f"expected a PNG of the same stem for each, such as {PurePath(photos[0]).stem}.png"
+            found = f"none of its {len(files)} PNG files is named as a photo" if files else "holds no PNG"
+            raise InputError(f"{folder}: {found}; {such}")
 
 
 def finished(source: Path, output: Path, config: MapConfig, mark: str, progress: Progress) -> Map | None:

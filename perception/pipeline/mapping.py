@@ -25,7 +25,7 @@ from perception.masks.compute import load_segmentation
 from perception.photos.scene_file import load_saved_scene, save_scene
 from perception.photos.view_json import stored_view
 from perception.pipeline.blocks import cut, optimise_blocks
-from perception.pipeline.changes import finished, hold_inputs
+from perception.pipeline.changes import finished, hold_inputs, refuse_unnamed
 from perception.pipeline.checkpoint import check_name, fingerprint, frames_folder, poses_mark, working
 from perception.pipeline.estimate import log_estimate
 from perception.pipeline.instances import DescribedInstances, describe, group_gaussians
@@ -63,7 +63,7 @@ def build_map(
         return made
     with working(source, output, resume) as work:
         # Files, models and devices are opened first, so that errors appear before hours of work.
-        hold_inputs(work, source, config, output)
+        refuse_unnamed(hold_inputs(work, source, config, output), config)
         run = Run.begun(source, config, work, progress, engine)
         masks, encoder, reader = _open_models(run)
         splat = open_splat(source, config)

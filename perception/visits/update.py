@@ -36,7 +36,7 @@ from perception.map.write import Map, read_map, write_map
 from perception.masks import make_source
 from perception.photos.decode import scaled_size
 from perception.photos.view_json import StoredView, moved_record, stored_view
-from perception.pipeline.changes import finished, hold_inputs
+from perception.pipeline.changes import finished, hold_inputs, refuse_unnamed
 from perception.pipeline.checkpoint import check_name, digest, fingerprint, working
 from perception.pipeline.estimate import check_size
 from perception.pipeline.instances import DescribedInstances, describe
@@ -80,7 +80,7 @@ def update_map(
     if resume and (made := finished(source, output, config, mark, progress)) is not None:
         return made
     with working(source, output, resume) as work:
-        hold_inputs(work, source, config, output)
+        refuse_unnamed(hold_inputs(work, source, config, output), config)
         run = Run.begun(source, config, work, progress)
         masks = make_source(config.masks, config.sam)
         _refuse_other_masks(gmap, masks.name)
