@@ -191,8 +191,10 @@ def _read_facts(path: Path) -> tuple[dict[str, Any], bytes]:
         raw = file.read_bytes()
         info = parsed(raw)
         version = info["format_version"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{file}: cannot be read as a map's facts ({brief(error)})") from error
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({brief(error)}); allow access to it") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise damaged(file, f"cannot be read as a map's facts ({brief(error)})") from error
     if isinstance(version, bool) or not isinstance(version, int):
         raise damaged(file, f"format_version is {brief(version)}, expected {FORMAT_VERSION}")
     if version != FORMAT_VERSION:
@@ -221,4 +223,4 @@ def _damage_in(file: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, ValueError) as error:
-        raise damaged(file, str(error)) from error
+        raise damaged(file, str(error) if isinstance(error, ValueError) else brief(error)) from error
