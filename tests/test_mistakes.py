@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib.util
 import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,8 +15,11 @@ from PIL import Image
 
 from perception.cli import main
 from perception.inputs.load import load_scene
+from perception.machine import refuse_full_disk
 from perception.map.outputs import refuse_inputs
+from perception.map.replace import writing
 from perception.map.write import read_map, write_map
+from perception.pipeline.checkpoint import work_folder
 from perception.sfm.options import ReadOptions
 from support.given_poses import NAMES, photo, write_model
 from support.visited_map import write_visited_map
@@ -43,6 +48,9 @@ def gmap(tmp_path: Path) -> Path:
             "map . -o m --max-sied 640",
             "perception map: unrecognized arguments: --max-sied 640, did you mean --max-side?",
         ),
+        ("update m v -o n --preset fast", "perception update: unrecognized arguments: --preset fast (see"),
+        ("node m --domain x", "--domain: found 'x', expected a whole number from 0 to 232"),
+        ("serve none", "none: no map lies there (No such file or directory); give a directory made by"),
         ("map . there -o m", "perception map: unrecognized arguments: there; options stand after all other"),
         ("query m mug --top 3 cup", "perception query: unrecognized arguments: cup; options stand after all other"),
         ("scale m --tag-size 5cm", "--tag-size: found '5cm', expected a number above 0 to 1000"),
@@ -133,6 +141,31 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_work(
     monkeypatch.setattr(os, "access", lambda *_: False)  # tests may run as root, whom nothing stops
     with pytest.raises(ValueError, match=r"out\.ply: cannot be written, as .* does not allow it"):
         refuse_inputs([tmp_path / "out.ply"], [])
+
+
+def test_a_run_that_is_going_on_is_not_told_to_be_unfinished(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Else people would remove the folder that it works in."""
+    photo(tmp_path / "photos/a.jpg")
+    out, argv = tmp_path / "m.gsmap", ("map", tmp_path / "photos", "-o", tmp_path / "m.gsmap")
+    work_folder(out).mkdir()
+    with ThreadPoolExecutor(1) as other, writing(out):
+        assert "is writing this map; wait for it to finish" in other.submit(told, capsys, *argv).result()
+    assert "an unfinished run lies there; go on with --resume or remove the folder" in told(capsys, *argv)
+
+
+def test_a_map_is_no_photos(gmap: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert f"{gmap}: is a map; give a folder of photos" in told(capsys, "map", gmap, "-o", tmp_path / "m.gsmap")
+
+
+def test_a_full_disk_is_told_by_the_number_of_photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """COLMAP aborts the process where it cannot write."""
+    refuse_full_disk(tmp_path)
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=300 << 20))
+    refuse_full_disk(tmp_path, 40)
+    with pytest.raises(ValueError, match="has 300 MiB free, at least 1256 are needed"):
+        refuse_full_disk(tmp_path, 1000)
 
 
 @pytest.mark.parametrize(

@@ -27,8 +27,9 @@ class Parser(argparse.ArgumentParser):
         """As argparse, but a subcommand itself refuses what it does not know."""
         given, unknown = super().parse_known_args(*args, **kwargs)
         if unknown:
-            near = difflib.get_close_matches(unknown[0], self._option_string_actions, 1)
-            advice = f", did you mean {near[0]}?" if near else ""
+            options = [option.lstrip("-") for option in self._option_string_actions]
+            near = difflib.get_close_matches(unknown[0].strip("-").partition("=")[0], options, 1, 0.7)
+            advice = f", did you mean --{near[0]}?" if near else ""
             if not unknown[0].startswith("-"):
                 advice = "; options stand after all other arguments, and a text with blanks in quotes"
             self.error(f"unrecognized arguments: {' '.join(unknown)}{advice}")

@@ -88,14 +88,13 @@ def _mcp(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _node(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.config import read_pairs
-    from perception.node.config import node_config
+    from perception.config import read_pairs, settings_from
+    from perception.node.config import NodeConfig
 
-    values = read_pairs(args.pairs)
-    for name in ("namespace", "domain"):
-        if getattr(args, name) is not None:
-            values[name] = getattr(args, name)
-    config = node_config(values)
+    given = {key: (value, "--set") for key, value in read_pairs(args.pairs).items()}
+    options = {name: (getattr(args, name), f"--{name}") for name in ("namespace", "domain")}
+    given |= {name: option for name, option in options.items() if option[0] is not None}
+    config = settings_from(NodeConfig, given)
     from perception.node.ros import serve_node, stop_on_signals
 
     with stop_on_signals() as stop:

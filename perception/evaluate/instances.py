@@ -301,6 +301,9 @@ def run_instances(prediction: str | Path, truth: str | Path, protocol: str = "sc
         raise InputError(f"{counts}; both must be the same points in the same order")
     rules, source = get_protocol(protocol), Path(prediction).with_suffix(".json")
     confidence = read_scores(source) if source.is_file() else None
+    if confidence is not None and (lacking := set(pred_ids[pred_ids >= 0].tolist()) - confidence.keys()):
+        found = f"has no score for instance {min(lacking)} ({len(lacking)} such)"
+        raise InputError(f"{source}: {found}; give the one that was written with {prediction}")
     ignore = gt.labels.get("ignore")
     result = evaluate(pred_ids, confidence, gt_ids, rules, None if ignore is None else ignore != 0)
     result["void_points"] = {"negative": int((gt_ids < 0).sum())}

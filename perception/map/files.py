@@ -169,7 +169,8 @@ def map_signature(path: Path) -> Signature:
     try:
         stats = [file.stat() for file in (folder, *(folder / name for name in names))]
     except OSError as error:
-        raise InputError(f"{path}: the map is gone ({error.strerror}); build it again or put it back") from error
+        todo = "give a directory made by `perception map`, or put it back"
+        raise InputError(f"{path}: no map lies there ({error.strerror}); {todo}") from error
     return tuple((stat.st_ino, stat.st_mtime_ns if n else 0, stat.st_size if n else 0) for n, stat in enumerate(stats))
 
 

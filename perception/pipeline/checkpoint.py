@@ -37,7 +37,9 @@ from perception.inputs.readers import EXPECTED, is_splat
 from perception.io.atomic import atomic_file, delete
 from perception.io.documents import brief, refusing
 from perception.machine import peak_memory_mib, refuse_full_disk
+from perception.map.checksums import is_map
 from perception.map.replace import writing
+from perception.photos.folder import list_photos
 from perception.photos.video import FRAMES_RECORD
 from perception.progress import Progress
 
@@ -277,10 +279,14 @@ def _remove(work: Path) -> None:
 def _prepare(source: Path, output: Path, resume: bool) -> Path:
     if not source.exists():
         raise InputError(f"{source}: does not exist; give {EXPECTED}")
+    if is_map(source) and not list_photos(source):
+        raise InputError(f"{source}: is a map; give {EXPECTED}")
     if output.exists():
         raise InputError(f"{output}: exists already; choose another -o or remove it first")
     work = work_folder(output)
     if work.exists() and not resume:
+        with writing(output):  # InputError where another run works there now
+            pass
         raise InputError(f"{work}: an unfinished run lies there; go on with --resume or remove the folder")
     try:
         work.mkdir(parents=True, exist_ok=True)

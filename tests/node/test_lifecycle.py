@@ -147,4 +147,4 @@ def test_where_to_stand_by_the_service(tmp_path: Path) -> None:
 def test_a_node_that_starts_itself_ends_with_2_on_bad_input(tmp_path: Path) -> None:
     node = started("lifecycle_process.py", "--ros-args", "-p", f"map:={tmp_path}/none", "-p", "autostart:=true")
     errors = node.communicate(timeout=WAIT)[1]
-    assert node.returncode == 2 and "none: the map is gone" in errors
+    assert node.returncode == 2 and "none: no map lies there" in errors
