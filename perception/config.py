@@ -271,9 +271,8 @@ def load_config(
     folder: Path | None = None,
     options: Mapping[str, tuple[Any, str]] | None = None,
 ) -> MapConfig:
-    """Defaults, overridden by the preset, settings `given` as in `settings_from`, the TOML file, KEY=VALUE pairs, and
-    settings as `options` give them. folder: that to which paths in settings are relative, None for the current one.
-    InputError for the first error.
+    """Defaults, overridden by the preset, `given` settings (see `settings_from`), the TOML file, KEY=VALUE pairs and
+    `options`, as `given`. folder: that of relative paths in settings; None: the current one. InputError: the first.
 
     >>> config = load_config(pairs=["train.iterations=500", "masks=labels:labels"], preset="fast")
     >>> config.train.iterations, config.train.effort, config.masks
@@ -291,8 +290,8 @@ def load_config(
 def settings_from(
     model: type[AnySettings], given: Mapping[str, tuple[Any, str]], folder: Path | None = None
 ) -> AnySettings:
-    """The model with the given settings: dotted key -> (value, where it was read: --set, --preset, a file, or the
-    option of this setting alone). folder: as of `load_config`.
+    """The model with the given settings: dotted key -> (value, --set, --preset, a file, or the option of this setting
+    alone). folder: as of `load_config`.
 
     Raises InputError with key, value and range for the first setting that is unknown, of another type or out of range.
     """

@@ -14,12 +14,13 @@ import pytest
 from PIL import Image
 
 from perception.cli import main
+from perception.errors import InputError
 from perception.inputs.load import load_scene
 from perception.machine import refuse_full_disk
 from perception.map.outputs import refuse_inputs
 from perception.map.replace import writing
 from perception.map.write import read_map, write_map
-from perception.pipeline.checkpoint import work_folder
+from perception.pipeline.checkpoint import work_folder, working
 from perception.sfm.options import ReadOptions
 from support.given_poses import NAMES, photo, write_model
 from support.visited_map import write_visited_map
@@ -153,6 +154,20 @@ def test_a_run_that_is_going_on_is_not_told_to_be_unfinished(
     with ThreadPoolExecutor(1) as other, writing(out):
         assert "is writing this map; wait for it to finish" in other.submit(told, capsys, *argv).result()
     assert "an unfinished run lies there; go on with --resume or remove the folder" in told(capsys, *argv)
+
+
+def test_poses_that_were_found_outlive_an_error_after_them(tmp_path: Path) -> None:
+    """Such as --tag-size where no photo shows a tag: what took longest is not thrown away."""
+    photo(tmp_path / "photos/a.jpg")
+    kept = pytest.raises(InputError, match="no tag; the poses that were found are kept: go on with --resume")
+    with kept, working(tmp_path / "photos", tmp_path / "a.gsmap", resume=False) as work:
+        (work / "sfm" / "mark" / "model").mkdir(parents=True)
+        (work / "sfm" / "mark" / "model" / "report.json").touch()
+        raise InputError("no tag")
+    assert (work / "sfm" / "mark" / "model").is_dir()
+    with pytest.raises(InputError, match=r"^too few$"), working(tmp_path / "photos", tmp_path / "b", False) as other:
+        raise InputError("too few")
+    assert not other.exists()
 
 
 def test_a_map_is_no_photos(gmap: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -240,7 +240,8 @@ def frames_folder(output: Path) -> Path:
 def working(source: Path, output: Path, resume: bool) -> Iterator[Path]:
     """Yields the work folder of a run that makes `output`, locked; it is deleted when the block ends without an error.
 
-    After an error it is kept for `--resume`, except for an InputError before training. InputError for a missing source,
+    After an error it is kept for `--resume`, except for an InputError before training, unless poses were found by then.
+    InputError for a missing source,
     an output or unfinished run that already exists, and a full disk.
     """
     fresh, had_frames = not work_folder(output).exists(), frames_folder(output).exists()
@@ -253,7 +254,9 @@ def working(source: Path, output: Path, resume: bool) -> Iterator[Path]:
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
             raise InputError(f"{work}: the disk is full; free some space and go on with --resume") from error
-        except InputError:
+        except InputError as error:
+            if fresh and any(work.glob("sfm/**/model/report.json")) and not any(work.rglob("*.pt")):
+                raise InputError(f"{error}; the poses that were found are kept: go on with --resume") from error
             if fresh and not any(work.rglob("*.pt")):  # also of a block
                 _remove(work)
                 if not had_frames and (frames_folder(output) / FRAMES_RECORD).is_file():
