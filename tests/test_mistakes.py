@@ -51,7 +51,7 @@ def gmap(tmp_path: Path) -> Path:
         ),
         ("update m v -o n --preset fast", "perception update: unrecognized arguments: --preset fast (see"),
         ("node m --domain x", "--domain: found 'x', expected a whole number from 0 to 232"),
-        ("serve none", "none: no map lies there (No such file or directory); give a directory made by"),
+        ("serve none", "none: no map lies there, or it is gone (No such file or directory); give a directory"),
         ("map . there -o m", "perception map: unrecognized arguments: there; options stand after all other"),
         ("query m mug --top 3 cup", "perception query: unrecognized arguments: cup; options stand after all other"),
         ("scale m --tag-size 5cm", "--tag-size: found '5cm', expected a number above 0 to 1000"),

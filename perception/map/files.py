@@ -170,7 +170,7 @@ def map_signature(path: Path) -> Signature:
         stats = [file.stat() for file in (folder, *(folder / name for name in names))]
     except OSError as error:
         todo = "give a directory made by `perception map`, or put it back"
-        raise InputError(f"{path}: no map lies there ({error.strerror}); {todo}") from error
+        raise InputError(f"{path}: no map lies there, or it is gone ({error.strerror}); {todo}") from error
     return tuple((stat.st_ino, stat.st_mtime_ns if n else 0, stat.st_size if n else 0) for n, stat in enumerate(stats))
 
 

@@ -31,9 +31,9 @@ def is_local(host: str) -> bool:
 def check_address(host: str, port: int, token: str | None) -> None:
     """Raises InputError for a port out of range, and for a host that others can reach without a token."""
     if not 0 <= port <= 65535:
-        raise InputError(f"--port: found {port}, expected 0 to 65535")
+        raise InputError(f"port: found {port}, expected 0 to 65535")
     if token is None and not is_local(host):
-        raise InputError(f"--host {host}: others could reach the map there, so a token is needed: {MAKE_TOKEN}")
+        raise InputError(f"host {host}: others could reach the map there, so a token is needed: {MAKE_TOKEN}")
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def url_host(host: str) -> str:
 
 def listen(host: str, port: int) -> socket.socket:
     """A bound, listening TCP socket; InputError naming the argument when the address or port is not available."""
-    with refusing(f"--host {host}: is no address of this machine ({{why}})"):
+    with refusing(f"host {host}: is no address of this machine ({{why}})"):
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
     family, kind, protocol, _, address = found[0]
     sock = socket.socket(family, kind, protocol)
@@ -76,10 +76,10 @@ def listen(host: str, port: int) -> socket.socket:
     except OSError as error:
         sock.close()
         if error.errno == errno.EADDRINUSE:
-            raise InputError(f"--port {port}: is in use on {host}; stop that server or choose another port") from error
+            raise InputError(f"port {port}: is in use on {host}; stop that server or choose another port") from error
         if error.errno == errno.EADDRNOTAVAIL:
-            raise InputError(f"--host {host}: is no address of this machine") from error
-        raise InputError(f"--host {host} --port {port}: cannot listen there ({error.strerror})") from error
+            raise InputError(f"host {host}: is no address of this machine") from error
+        raise InputError(f"host {host}, port {port}: cannot listen there ({error.strerror})") from error
     return sock
 
 

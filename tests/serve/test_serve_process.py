@@ -145,7 +145,7 @@ def test_a_port_in_use_is_told_before_the_map_is_opened(tmp_path: Path, capsys: 
         port = str(taken.getsockname()[1])
         assert main(["serve", str(tmp_path / "none.gsmap"), "--port", port]) == 2
     told = capsys.readouterr().err
-    assert told.count("\n") == 1 and f"--port {port}: is in use" in told
+    assert told.count("\n") == 1 and f"error: port {port}: is in use" in told
 
 
 @pytest.mark.slow
