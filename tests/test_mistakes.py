@@ -78,7 +78,7 @@ def test_the_number_of_hits_is_named_as_the_option_is(gmap: Path, capsys: pytest
     [
         ("map", "what was done is kept, go on with: perception map a --resume"),
         ("index", "what was done is kept, go on with: perception index a"),
-        ("export", "nothing is kept, begin again with: perception export a"),
+        ("export", "begin again with: perception export a"),
     ],
 )
 def test_what_an_interrupted_command_keeps(
@@ -99,6 +99,15 @@ def test_the_demo_wants_its_extra_before_any_work(
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *_: None if name == "tokenizers" else find(name))
     line = told(capsys, "demo", "-o", tmp_path / "demo")
     assert line.endswith("the package 'tokenizers' is not installed; run in its clone: pip install \".[demo]\"")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_demo_that_was_stopped_can_begin_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("perception.pipeline.demo.build_map", interrupt)
+    assert main(["demo", "-o", str(tmp_path / "demo")]) == 130
     assert not list(tmp_path.iterdir())
 
 

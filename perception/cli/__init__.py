@@ -43,7 +43,7 @@ def _interrupted(argv: Sequence[str] | None) -> str:
     """What to do after Ctrl-C."""
     arguments = [str(argument) for argument in (sys.argv[1:] if argv is None else argv)]
     more = ["--resume"] if arguments[:1] in _KEEPING[:2] and "--resume" not in arguments else []
-    kept = "what was done is kept, go on with" if arguments[:1] in _KEEPING else "nothing is kept, begin again with"
+    kept = "what was done is kept, go on with" if arguments[:1] in _KEEPING else "begin again with"
     return f"interrupted; {kept}: {shlex.join(['perception', *arguments, *more])}"
 
 

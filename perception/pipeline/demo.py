@@ -57,10 +57,19 @@ class DemoTruth:
 
 
 def run_demo(output: Path, progress: Progress, seed: int = 0) -> tuple[dict[str, Any], str]:
-    """Photos → SfM → masks → map → export → queries, all in `output`; returns figures and a text."""
-    started = time.monotonic()
-    make_encoder("conse")  # InputError where the extra `demo` is not installed
+    """Photos → SfM → masks → map → export → queries, all in `output`; returns figures and a text.
+    InputError, before any work, where the extra `demo` is not installed or `output` is not empty."""
+    make_encoder("conse")
     check_empty(output)
+    try:
+        return _run(output, progress, seed)
+    except BaseException:  # Ctrl-C among them: a new run wants an empty folder
+        shutil.rmtree(output, ignore_errors=True)
+        raise
+
+
+def _run(output: Path, progress: Progress, seed: int) -> tuple[dict[str, Any], str]:
+    started = time.monotonic()
     photos, map_path = output / "photos", output / "demo.gsmap"
     shutil.copytree(SCENE / "photos", photos)
     truth = DemoTruth.read()
