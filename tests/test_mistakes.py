@@ -172,8 +172,10 @@ def test_poses_that_were_found_outlive_an_error_after_them(tmp_path: Path) -> No
     with kept, working(tmp_path / "photos", tmp_path / "a.gsmap", resume=False) as work:
         (work / "sfm" / "mark" / "model").mkdir(parents=True)
         (work / "sfm" / "mark" / "model" / "report.json").touch()
+        (work / "inputs.json").write_text('{"input=/photos": {"a.jpg": "1 2"}, "masks=/labels": {"a.png": "3 4"}}')
         raise InputError("no tag")
     assert (work / "sfm" / "mark" / "model").is_dir()
+    assert "labels" not in (work / "inputs.json").read_text()  # which may be mended
     with pytest.raises(InputError, match=r"^too few$"), working(tmp_path / "photos", tmp_path / "b", False) as other:
         raise InputError("too few")
     assert not other.exists()

@@ -34,7 +34,7 @@ from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.train import Trainer
 from perception.inputs.readers import EXPECTED, is_splat
-from perception.io.atomic import atomic_file, delete
+from perception.io.atomic import atomic_file, delete, write_file
 from perception.io.documents import brief, refusing
 from perception.machine import peak_memory_mib, refuse_full_disk
 from perception.map.checksums import is_map
@@ -241,8 +241,7 @@ def working(source: Path, output: Path, resume: bool) -> Iterator[Path]:
     """Yields the work folder of a run that makes `output`, locked; it is deleted when the block ends without an error.
 
     After an error it is kept for `--resume`, except for an InputError before training, unless poses were found by then.
-    InputError for a missing source,
-    an output or unfinished run that already exists, and a full disk.
+    InputError for a missing source, an output or unfinished run that already exists, and a full disk.
     """
     fresh, had_frames = not work_folder(output).exists(), frames_folder(output).exists()
     work = _prepare(source, output, resume)
@@ -255,13 +254,24 @@ def working(source: Path, output: Path, resume: bool) -> Iterator[Path]:
                 raise
             raise InputError(f"{work}: the disk is full; free some space and go on with --resume") from error
         except InputError as error:
-            if fresh and any(work.glob("sfm/**/model/report.json")) and not any(work.rglob("*.pt")):
-                raise InputError(f"{error}; the poses that were found are kept: go on with --resume") from error
-            if fresh and not any(work.rglob("*.pt")):  # also of a block
+            trained = any(work.rglob("*.pt"))  # also of a block
+            if not trained and any(work.glob("sfm/**/model/report.json")):
+                _forget_masks(work)
+                if fresh:
+                    raise InputError(f"{error}; the poses that were found are kept: go on with --resume") from error
+            elif fresh and not trained:
                 _remove(work)
                 if not had_frames and (frames_folder(output) / FRAMES_RECORD).is_file():
                     shutil.rmtree(frames_folder(output), ignore_errors=True)
             raise
+
+
+def _forget_masks(work: Path) -> None:
+    """Takes label images off the list of input files: they may be mended, as no training has used them."""
+    file = work / INPUTS
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # the list is damaged, as is told
+        kept = {key: files for key, files in json.loads(file.read_bytes()).items() if not key.startswith("masks=")}
+        write_file(file, json.dumps(kept))
 
 
 def clear_work(output: Path) -> None:
