@@ -114,7 +114,7 @@ def test_a_name_means_the_thing_that_stands_today(tmp_path: Path, capsys: pytest
         (["--known-length", "nan: A, B"], "METRES: LABEL, LABEL"),
         (["--known-length", "1: A, mug"], "0 instances are called 'mug'"),
         (["--known-length", "1: 0,0,0 0,0,0.01"], "too near each other"),
-        (["--tag-size", "-1"], "--tag-size tag_size: found '-1', expected a number above 0"),
+        (["--tag-size", "-1"], "--tag-size: found '-1', expected a number above 0"),
         (["--tag-size", "0.1"], "photo is missing"),
     ],
 )
