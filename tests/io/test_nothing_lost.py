@@ -286,7 +286,7 @@ def test_exported_splats_overwrite_no_input(gmap: Path, tmp_path: Path, capsys: 
     before = scan.read_bytes()
     command = ["export", str(gmap), "--splat", str(tmp_path / "scan.ply"), "--each"]
     assert main([*command, "--points", str(scan), "-o", str(tmp_path / "labelled.ply")]) == 2
-    assert "which this command reads" in capsys.readouterr().err and scan.read_bytes() == before
+    assert "scan-0.ply: lies there" in capsys.readouterr().err and scan.read_bytes() == before
     assert main([*command[:-1], "--only", "0", "1", "--without", "1"]) == 0
     assert len(map_ply(tmp_path / "scan.ply", "vertex")) == np.sum(ids == 0)
 
