@@ -79,8 +79,9 @@ class TrainingState:
 
     gaussians, views, held_out: on the CPU. Gaussians, optimiser and training views are then kept on `device`. box:
     [2, 3] corners of the space that matters, in which most Gaussians are added; None: all. held: the first rows, of
-    which nothing but the colours is trained, and that are never dropped. by_stereo: the Gaussians lie on a surface that
-    stereo found, so the space before the cameras is kept free (`free_space`).
+    which nothing but the colours is trained, and that are never dropped; fixed: [held] bool, of those the rows of which
+    nothing is, None: none. by_stereo: the Gaussians lie on a surface that stereo found, so the space before the cameras
+    is kept free (`free_space`).
     """
 
     def __init__(
@@ -92,11 +93,14 @@ class TrainingState:
         device: torch.device | None = None,
         box: np.ndarray | None = None,
         held: int = 0,
+        fixed: np.ndarray | None = None,
         by_stereo: bool = False,
     ):
         self.held = held
         self.config = sized(config, len(views))
         self.device = device or torch.device("cpu")
+        fixed = np.zeros(held, bool) if fixed is None else fixed
+        self.fixed = torch.from_numpy(np.flatnonzero(fixed)).to(self.device)
         self.held_out = held_out
         self.box = None if box is None else torch.tensor(box, dtype=torch.float32, device=self.device)
         self.extent = scene_extent(views)

@@ -141,8 +141,8 @@ class Trainer(TrainingState):
         by_name = {stored: getattr(gradients, name) for name, stored in STORED.items()}
         if self.held:  # a row of zero gradients and moments stays as it is
             for name, gradient in by_name.items():
-                if name != "sh" and gradient is not None:
-                    gradient[: self.held] = 0
+                if gradient is not None:
+                    gradient[: self.held][self.fixed if name == "sh" else ...] = 0
         self.record.skipped_gradients += int(self.optimiser.step(rates, by_name, visible))
 
     def _losses(self, view: TrainingView, out: Forward) -> tuple[float, Cotangents]:

@@ -89,10 +89,12 @@ def trained(
     held: int,
     rehearsed: Sequence[TrainingView],
     alone: bool = False,
+    fixed: np.ndarray | None = None,
 ) -> tuple[Gaussians, TrainRecord]:
     """Trains one leg on the photos and on what is `rehearsed`: all of the Gaussians beyond the first `held` rows, and
-    the colours of those. From its checkpoint on, if there is one that began with these Gaussians: other settings of
-    instances, or more time for the leg before, give others. On the CPU. share, alone: see `update_config`."""
+    the colours of those but for the ones that are `fixed` [held] bool. From its checkpoint on, if there is one that
+    began with these Gaussians: other settings of instances, or more time for the leg before, give others. On the CPU.
+    share, alone: see `update_config`."""
     run, photos = visit.run, visit.photos
     config = update_config(run.config, len(photos.views), share, held + SPARE * (len(gaussians) - held), alone)
     start = hashlib.sha256()
@@ -100,7 +102,7 @@ def trained(
         start.update(tensor.contiguous().numpy().data)
     work = run.work / f"leg-{leg}-{start.hexdigest()[:16]}"
     work.mkdir(exist_ok=True)
-    trainer = Trainer(gaussians, [*photos.views, *rehearsed], config, photos.held, run.device, held=held)
+    trainer = Trainer(gaussians, [*photos.views, *rehearsed], config, photos.held, run.device, held=held, fixed=fixed)
     trainer.stopping.degree_decided = True  # the map's
     observer = TrainingObserver(work, visit.mark, "", 0.0, run.progress)  # the mark is also of the masks
     observer.take_up(trainer)

@@ -31,6 +31,7 @@ from perception.map.map import Map
 from perception.visits.ghosts import ghosts
 from perception.visits.growth import GROWING, SETTLING, grouped, joined_instances, new_surface, trained
 from perception.visits.pairing import Pairs, Thing, moved
+from perception.visits.rows import told_rows
 from perception.visits.visit import Owned, Visit, gaussians_of
 
 GONE = -0.5
@@ -280,8 +281,8 @@ def _settled(
     alone: bool,
 ) -> tuple[Owned, TrainRecord]:
     """The Gaussians of today that photos show: what stays of `owned`, whose first rows are the rows `kept` [H] of the
-    map, without the rows `leaves`, and the moved things with their own Gaussians. The colours of all that was looked at
-    are trained. new: rows of the new things; alone: whether this is the only training."""
+    map, without the rows `leaves`, and the moved things with their own Gaussians. Colours are trained, of the map's
+    rows those that photos tell (`told_rows`). new: rows of the new things; alone: whether this is the only training."""
     gmap = visit.gmap
     stays = np.setdiff1d(np.arange(len(owned.gaussians)), leaves)
     parts = [owned.rows(stays)]
@@ -292,15 +293,17 @@ def _settled(
         hues.append(visit.hues(own.gaussians))
     today = Owned.concatenate(parts)
     together = today.gaussians
-    start = together.sh[: len(kept)].clone()
+    with visit.run.stage("look"):
+        fixed = ~told_rows(together, [view for view, _ in visit.frames])
+    fixed[len(kept) :] = False
+    rows = np.flatnonzero(fixed)
+    together.sh[torch.from_numpy(rows)] = visit.seen(gaussians_of(gmap, kept[rows])).sh
     came = np.append(np.isin(stays, new), np.ones(len(together) - len(stays), bool))
     stood = np.isin(visit.rows, kept)
     others = [visit.part(~stood), together.rows(torch.from_numpy(np.flatnonzero(came)))]
     memory = visit.rehearsed(visit.part(stood), Gaussians.concatenate(others))
-    final, record = trained(visit, "settle", SETTLING, together, len(together), memory, alone)
-    unseen = (final.sh[: len(kept)] == start).flatten(1).all(dim=1)
+    final, record = trained(visit, "settle", SETTLING, together, len(together), memory, alone, fixed)
     final = in_grey(final) if visit.grey else final
     final.sh[:, 0] += torch.cat(hues)
-    original = torch.from_numpy(gmap.sh[kept])
-    final.sh[: len(kept)] = torch.where(unseen[:, None, None], original, final.sh[: len(kept)])
+    final.sh[torch.from_numpy(rows)] = torch.from_numpy(gmap.sh[kept[rows]])
     return replace(today, gaussians=final), record

@@ -1,4 +1,4 @@
-"""Training with held rows: nothing but their colours changes, and nothing at all of what no photo sees."""
+"""Training with held rows: nothing but their colours changes, and nothing of those that are fixed or not seen."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from perception.gaussians.model import HeldGaussians, from_points
 from perception.gaussians.train import Trainer
 from perception.gaussians.views import TrainingView
 
-HELD, BEHIND = 40, 10
+HELD, BEHIND, FIXED = 40, 10, 25
 
 
-def test_held_rows_keep_all_but_their_colours() -> None:
+@pytest.mark.parametrize("fixed", [None, np.arange(HELD) >= FIXED], ids=["none fixed", "some fixed"])
+def test_held_rows_keep_all_but_their_colours(fixed: np.ndarray | None) -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-1, 1, (80, 3)) + np.array([0, 0, 4])
     points[:BEHIND, 2] *= -1  # behind all cameras
@@ -30,7 +31,7 @@ def test_held_rows_keep_all_but_their_colours() -> None:
         photo = torch.from_numpy(rng.integers(0, 255, (32, 48, 3)).astype(np.uint8))
         views.append(TrainingView(str(n), photo, None, K, pose))
     config = load_config(None, ["train.iterations=200", "train.budget=200", "densify.every=20", "train.sh_degree=0"])
-    trainer = Trainer(gaussians, views, config, [], held=HELD)
+    trainer = Trainer(gaussians, views, config, [], held=HELD, fixed=fixed)
     trainer.run()
     after = trainer.gaussians
     assert len(after) > HELD
@@ -38,7 +39,8 @@ def test_held_rows_keep_all_but_their_colours() -> None:
         same = (after.named()[name][:HELD] == tensor[:HELD]).flatten(1 if tensor.ndim > 1 else 0)
         assert name == "sh" or bool(same.all()), name
     assert torch.equal(after.sh[:BEHIND], before.sh[:BEHIND])
-    assert not torch.equal(after.sh[BEHIND:HELD], before.sh[BEHIND:HELD])
+    assert not torch.equal(after.sh[BEHIND:FIXED], before.sh[BEHIND:FIXED])
+    assert torch.equal(after.sh[FIXED:HELD], before.sh[FIXED:HELD]) == (fixed is not None)
 
 
 def test_those_not_held_lie_along_a_curve_with_all_that_is_theirs() -> None:

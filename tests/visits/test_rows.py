@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,7 +14,7 @@ from perception.gaussians.model import Gaussians
 from perception.gaussians.views import TrainingView, render
 from perception.map.map import Map
 from perception.pipeline.optimise import Photos
-from perception.visits.rows import shape_of, shown_rows
+from perception.visits.rows import TOLD, shape_of, shown_rows, told_rows
 from perception.visits.visit import Visit, gaussians_of
 
 WALL, BEYOND, PANEL = 2.0, 4.0, 1.4
@@ -85,6 +86,22 @@ def test_what_is_behind_a_wall_is_out_and_what_an_opening_shows_is_in() -> None:
     wall = gmap.means[where["wall"]].astype(np.float64)
     free = (np.abs(wall[:, 1] / WALL) < 0.37) & (np.abs(wall[:, 0]) < 1.4) & (np.abs(wall[:, 0] + 0.15) > 0.6)
     assert free.sum() > 3000 and found[where["wall"][free]].all() and found[where["panel"]].all()
+
+
+def test_colours_are_told_of_what_fills_enough_pixels_and_not_of_what_is_behind_a_wall() -> None:
+    """By the closed form: a Gaussian of opacity o and σ pixels fills 2π σ² o of each picture. Of two in the pictures
+    one fills .6 pixels of both, the other 2; of two with centres 15 pixels beside a picture one fills 60 of it."""
+    gmap, where = two_rooms()
+    whole = shape_of(gmap)
+    points = torch.tensor([[0.3, 0.2, 1.0], [-0.3, 0.2, 1.0], [1.25, 0.0, 1.0], [-1.25, 0.0, 1.0]])
+    sizes, opacities = torch.tensor([0.01, 0.01, 0.04, 0.1]), torch.tensor([0.03, 0.12, 0.5, 0.5])
+    log_scales = sizes.log()[:, None].expand(4, 3)
+    dust = replace(whole.rows(torch.arange(4)), means=points, log_scales=log_scales, opacity_logits=opacities.logit())
+    found = told_rows(Gaussians.concatenate([whole, dust]), [eye(x) for x in EYES])
+    assert TOLD == (1, 10) and found[-4:].tolist() == [False, True, False, True]
+    room = gmap.means[where["room"]].astype(np.float64)
+    hidden = np.all([~through(room, x, WALL, *OPENING, -0.1) for x in EYES], axis=0)
+    assert found[where["room"]].sum() > 300 and not found[where["room"][hidden]].any()
 
 
 IN_MEMORY = SimpleNamespace(new_keep=lambda: np.asarray)

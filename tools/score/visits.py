@@ -6,7 +6,8 @@ VISIT1 and VISIT2 are truth folders, as `worlds.visits` writes them; VISIT2 hold
 made in WORK, and kept. Two tables: `update` of the first map; and the naive way, in which instances of the two maps are
 matched by place and size. An instance is the thing that it shares an IoU > .5 of true points with. A thing of which the
 second visit sees under 5 % is unseen; under 25 %, both its state and unseen are right. Of a thing that went and one of
-the same name that came ("cactus", "cactus 25") nobody can tell that it did not move: that is right for both.
+the same name that came ("cactus", "cactus 25") nobody can tell that it did not move: that is right for both. Then how
+far renders of what no photo of the second visit sees changed, as the update trains colours.
 """
 
 from __future__ import annotations
@@ -15,16 +16,22 @@ import argparse
 import json
 import re
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+import torch
 
+from perception.changes.evidence import AGREE, ROUGH, sight
 from perception.config import MapConfig, load_config
+from perception.gaussians.model import as_gaussians
+from perception.gaussians.views import expected_depth, render, unprojected
 from perception.io.cloud import read_cloud
 from perception.map.history import changes_of, visits_of
 from perception.map.write import Map, read_map
+from perception.photos.decode import scaled_K, scaled_size
 from perception.pipeline.mapping import build_map
 from perception.progress import Progress
 from perception.visits.scene import update_settings
@@ -94,6 +101,31 @@ def kept(before: Map, after: Map) -> np.ndarray:
     """[N] bool: Gaussians of a map that an update left where they were."""
     means = {mean.tobytes() for mean in after.means}
     return np.array([mean.tobytes() in means for mean in before.means], bool)
+
+
+def unseen_changes(before: Map, after: Map, most: int = 90) -> np.ndarray:
+    """[P] grey levels by which pixels of the map's views changed with the colours of `after`, the largest of three
+    channels each: those of which no photo of the last visit sees the surface, nor of their neighbours."""
+    rows, gaussians = {mean.tobytes(): i for i, mean in enumerate(after.means)}, as_gaussians(before)
+    same = np.array([rows.get(mean.tobytes(), -1) for mean in before.means])
+    sh = np.where((same < 0)[:, None, None], before.sh, after.sh[same])
+    today, visit = replace(gaussians, sh=torch.from_numpy(sh)), max(view.visit for view in after.views)
+    views, found = before.views[:: 1 + len(before.views) // most], []
+    for view in views:
+        width, height = scaled_size(view, ROUGH)
+        K, pose = scaled_K(view, width, height), view.camera_from_world
+        camera = torch.from_numpy(pose.astype(np.float32)), torch.from_numpy(K.astype(np.float32)), width, height
+        outs = [render(each, *camera, harmonics=True) for each in (gaussians, today)]
+        images = [out.colors[0].clamp(0, 1).numpy() for out in outs]
+        depth, (y, x) = expected_depth(outs[0]).numpy(), np.mgrid[:height, :width] + 0.5
+        found.append((unprojected(K, pose, x, y, depth), depth > 0, 255 * np.abs(images[0] - images[1]).max(axis=2)))
+    points, known, change = map(np.array, zip(*found, strict=True))
+    flat, seen = points.reshape(-1, 3), ~known.ravel()
+    for view in (view for view in after.views if view.visit == visit):
+        inside, z, mapped = sight(gaussians, view, flat)
+        seen[inside] |= (mapped == 0) | (z < (1 + AGREE) * mapped)
+    near = [cv2.dilate(each.astype(np.uint8), np.ones((3, 3))) for each in seen.reshape(known.shape)]
+    return np.asarray(change[np.array(near) == 0])
 
 
 def scores(changes: list[dict[str, Any]], first: Map, second: Map, truth: Truth) -> dict[str, Any]:
@@ -259,6 +291,10 @@ def main() -> None:
     truth = Truth.read(given.first, given.second)
     show("update", scores(changes_of(visits_of(today.info, len(today.views)), today.instances, 0), first, today, truth))
     show("two maps made apart", scores(naive(first, apart), first, apart, truth))
+    change = unseen_changes(first, today)
+    if len(change):
+        most, mean = change.max(), change.mean()
+        print(f"renders of what the visit does not see change by up to {most:.1f} of 255, {mean:.3f} in the mean")
     figures = [(name, gmap.info["quality"].get("psnr")) for name, gmap in (("update", today), ("new map", apart))]
     print("held-out PSNR: " + ", ".join(f"{name} {psnr:.2f} dB" for name, psnr in figures if psnr is not None))
     print(f"seconds: {seconds}")
