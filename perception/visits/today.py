@@ -95,7 +95,7 @@ def seen_today(visit: Visit) -> Today:
     with run.stage("instances"):
         owned, things = _grouped(visit, grown, visit.rows[stays])
     with run.stage("evidence"):
-        things, known = _true(visit, before, signs, grown, things, gone)
+        things, known, surface = _true(visit, before, signs, grown, things, gone)
     with run.stage("motion"):
         pairs = moved(visit, grown, things, gone)
         stands = [(j, carried(visit.thing(i), motion.new_from_old)) for i, (j, motion) in pairs.items()]
@@ -112,8 +112,8 @@ def seen_today(visit: Visit) -> Today:
         owned.ids[things[j][0]] = i
     own = np.isin(fresh, _rows(things))
     owned.membership[fresh[~own & (owned.ids[fresh] < 0)]] = 0
-    # Other new surface through which earlier photos saw stands where nothing did: an error.
-    wrong = np.append(_rows([things[j] for j in taken]), fresh[through & ~own])
+    # Other new surface through which earlier photos saw stands where nothing did: an error, unless masks outline it.
+    wrong = np.append(_rows([things[j] for j in taken]), fresh[through & ~own & ~np.isin(fresh, surface)])
     kept, rest = visit.rows[stays], np.setdiff1d(np.flatnonzero(~leaves), visit.rows)
     stood = ~np.isin(kept, ghost)  # ghosts go last: what grows beside them tells better what moved
     shift, kept, owned = np.sum(~stood), kept[stood], owned.rows(np.append(np.flatnonzero(stood), fresh))
@@ -188,11 +188,12 @@ def _without_fragments(made: Grouping, least: int) -> Grouping:
 
 def _true(
     visit: Visit, before: list[Look], known: list[Signs], grown: Gaussians, things: list[Thing], gone: list[int]
-) -> tuple[list[Thing], set[int]]:
+) -> tuple[list[Thing], set[int], np.ndarray]:
     """The things that photos show as they grew, with the outline of a mask: the others are ground that was hidden until
-    now, or errors. And the numbers of those that the old map shows as the photos do, `before`: it only did not know
-    them as things. What stands in front of a thing that is `gone`, or in its place, is none of these. known: signs of
-    the map's instances."""
+    now, or errors. Then the numbers of those that the old map shows as the photos do, `before`: it only did not know
+    them as things. What stands in front of a thing that is `gone`, or in its place, is none of these. Then the rows of
+    the others that masks of several photos outline: surface, if too coarse to tell. known: signs of the map's
+    instances."""
     after = visit.looks(grown, _numbered(len(grown), things))
     looks = [replace(old, ids=new.ids) for old, new in zip(before, after, strict=True)]
     pixels, instead = np.zeros(len(things)), np.zeros(len(things))
@@ -204,13 +205,11 @@ def _true(
     grew = signs_of(after, numbers, shares, shares * 0)
     usual = [each.outline for each in known if each.log_odds > 0 and np.isfinite(each.outline)]
     least = OUTLINED * float(np.median(usual or 1.0))
-    true = [
-        j
-        for j, (old, new) in enumerate(zip(signs, grew, strict=True))
-        if new.photos >= PHOTOS and new.alike >= GREW and not old.outline < least
-    ]
+    shown = [j for j, new in enumerate(grew) if new.photos >= PHOTOS]
+    true = [j for j in shown if grew[j].alike >= GREW and not signs[j].outline < least]
     stood = (signs[j].photos and signs[j].alike > 0 and not instead[j] > INSTEAD * pixels[j] for j in true)
-    return [things[j] for j in true], {n for n, each in enumerate(stood) if each}
+    surface = _rows([things[j] for j in shown if j not in true and things[j][1] >= LEAST_SCORE])
+    return [things[j] for j in true], {n for n, each in enumerate(stood) if each}, surface
 
 
 def _numbered(count: int, things: Sequence[Thing]) -> np.ndarray:
