@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
 from scipy.sparse import csr_matrix
 
-from perception.changes.evidence import signs_from
+from perception.changes.evidence import Signs, signs_from
 from perception.changes.look import Look, look
 from perception.config import load_config
 from perception.gaussians.model import Gaussians, isotropic
 from perception.gaussians.views import TrainingView, render
 from perception.masks.votes import MaskVotes
+from perception.visits import today
 from perception.visits.growth import grouped
 from perception.visits.today import _apart, _gone, _pieces
 from perception.visits.visit import Visit
@@ -107,3 +108,16 @@ def test_a_screen_as_large_as_the_room_goes_once_all_of_it_is_seen_through(seen_
     gone, haze = _gone(visit, looks, [other, other])
     assert gone == ([4, 9] if seen_through == 400 else [9])
     assert haze.tolist() == [n < seen_through for n in range(800)]
+
+
+def test_what_masks_outline_is_surface_though_too_coarse_to_be_a_thing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of four things that grew: one that photos show; one too coarse; one too coarse that masks hardly outline, and one
+    in a single photo."""
+    kinds = (5, 0.9), (5, 0.4), (5, 0.4), (1, 0.9)  # photos, correlation
+    grew = [Signs(n, 900, 1.0, known, 0.7, 0.1, 0.1, 0.8, 1.0, 0.9) for n, known in kinds]
+    assert [each.alike > 1 for each in grew] == [True, False, False, True]
+    monkeypatch.setattr(today, "signs_of", lambda *_: grew)
+    things = [(np.arange(5 * n, 5 * n + 5), score) for n, score in enumerate((0.9, 0.6, 0.3, 0.9))]
+    visit: Any = SimpleNamespace(looks=lambda *_: [])
+    true, _, surface = today._true(visit, [], [], cast(Any, range(20)), things, [])
+    assert [rows.tolist() for rows, _ in true] == [[0, 1, 2, 3, 4]] and surface.tolist() == [5, 6, 7, 8, 9]
