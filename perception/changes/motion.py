@@ -285,9 +285,9 @@ def settled(
     alike: float,
     seen: np.ndarray,
 ) -> Motion | None:
-    """The best of the two best motions after refinement; None where much of the thing would lie within others. alike:
+    """The best of the `found` motions after refinement; None where much of the thing would lie within others. alike:
     see `colours.looks_alike`; seen: see `look.seen_from`."""
-    likely = [each for each in found[:2] if each[0].same > found[0][0].same - BEHIND]
+    likely = [each for each in found if each[0].same > found[0][0].same - BEHIND]
     refine = _distinct([refined(old, each, cuts, depth, STEP, LEAST_STEP) for each in likely])
     (signs, pose), others = refine[0], refine[1:]
     shown, within = np.sum([cut.within(old, pose, depth) for cut in cuts], axis=0)
