@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from perception.changes.colours import in_grey
-from perception.changes.evidence import Signs, in_free_space, looked_at, seen_rows, signs_of
+from perception.changes.evidence import GONE, Signs, in_free_space, looked_at, seen_rows, signs_of
 from perception.changes.look import Look
 from perception.changes.motion import Motion
 from perception.changes.registration import REACH, Points, carried
@@ -34,9 +34,6 @@ from perception.visits.pairing import Pairs, Thing, moved
 from perception.visits.rows import told_rows
 from perception.visits.visit import Owned, Visit, gaussians_of
 
-GONE = -0.5
-"""Log-odds of standing where it stood, times the score, below which a thing does not. Of 126 things of made scenes that
-went one lies between this and 0, as do floors and walls of which little was measured."""
 BUILDING = 0.6
 """Of what a visit may see, the share from which a thing is a wall or a floor."""
 INSTEAD = 0.3
@@ -83,7 +80,7 @@ def seen_today(visit: Visit) -> Today:
     """Judges the map's instances, adds what is new, and finds out what moved."""
     gmap, run = visit.gmap, visit.run
     with run.stage("evidence"):
-        before = visit.looks(visit.gaussians, visit.ids)
+        before = visit.before
         signs = _signs(visit, before)
         gone, haze = _gone(visit, before, signs)
         leaves = np.isin(gmap.instance_ids, gone)

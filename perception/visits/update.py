@@ -2,7 +2,8 @@
 
 poses      of the photos in the map's frame, given or localised                           `scene`, `placing`
 look       exposure, stereo depth and masks of the photos; the map's render beside them   `visit`, `look`
-evidence   from both: things that stand where they stood, do not, or are in no photo      `evidence`, `ghosts`
+evidence   from both: things that stand where they stood, do not, or are in no photo      `evidence`, `ghosts`;
+           an instance of which a part went becomes two before                            `parted`, `parting`
 grow       from what stays: new Gaussians where the photos show another surface           `growth`, `carving`
 motion     from what grew: which new thing is which one that is gone, and how it moved    `motion`, `registration`
 settle     colours of all that was looked at; a moved thing keeps its own Gaussians       `growth`, `rehearsal`
@@ -44,6 +45,7 @@ from perception.pipeline.optimise import Optimised, Run
 from perception.pipeline.record import finite, score_views
 from perception.progress import QUIET, Progress
 from perception.types import View
+from perception.visits.parted import parted
 from perception.visits.record import (
     joined_language,
     kept_parts,
@@ -87,6 +89,8 @@ def update_map(
         encoder = _encoder_of(gmap, config.language.encoder)
         check_size(photo_sizes(source), config.photos.max_side)
         visit = open_visit(run, gmap, masks, output)
+        with run.stage("evidence"):
+            visit = parted(visit)
         today = seen_today(visit)
         described = _described(visit, today, encoder)
         made = assembled(visit, today, described, output, mark)

@@ -133,7 +133,10 @@ class Visit:
             ids, none = np.full(count, instance, np.int32), np.full(count, -1, np.int32)
             return Owned(self.away[instance], ids, np.ones(count, np.float32), none)
         rows = np.flatnonzero(self.gmap.instance_ids == instance)
-        return self.owned(rows[compact(self.gmap.means[rows].astype(np.float64))])
+        own = self.owned(rows[compact(self.gmap.means[rows].astype(np.float64))])
+        entry = next(entry for entry in self.gmap.instances if entry["id"] == instance)
+        own.part_ids[~np.isin(own.part_ids, [part["id"] for part in entry.get("parts", ())])] = -1
+        return own
 
     def seen(self, gaussians: Gaussians) -> Gaussians:
         """Gaussians of the map in the light of the visit, without colours if it is compared in grey."""
@@ -170,6 +173,11 @@ class Visit:
         """The training photos at the size at which they are compared, and what was measured in them."""
         pairs = zip(map(compared, self.photos.views), self.stereo, strict=True)
         return [(view, depth_at(stereo, view.photo.shape)) for view, stereo in pairs]
+
+    @cached_property
+    def before(self) -> list[Look]:
+        """The training photos beside the map."""
+        return self.looks(self.gaussians, self.ids)
 
     def looks(self, gaussians: Gaussians, ids: np.ndarray) -> list[Look]:
         """The training photos beside the Gaussians with instances ids [N]."""

@@ -36,7 +36,7 @@ from perception.map.write import Map, read_map
 from perception.pipeline.mapping import build_map
 from perception.visits.scene import update_settings
 from perception.visits.update import update_map
-from score.visits import Truth, kept, owners, scores
+from score.visits import Truth, as_cut, kept, owners, scores
 from worlds.visits import SHARE, make_visits
 
 VIEWS = {"tabletop": 36, "room": 56}
@@ -142,7 +142,7 @@ def scored(folder: Path, given: argparse.Namespace) -> list[dict[str, Any]]:
         today, seconds = timed(partial(update_map, old, source, path, update_settings(old, None, [masks(visit)])))
         truth = Truth.read(folder / f"visit{number - 1}", visit)
         told = changes_of(visits_of(today.info, len(today.views)), today.instances, number - 1)
-        row = scores(told, before, today, truth)
+        row = scores(told, as_cut(before, today), today, truth)
         row |= {"gaussians": len(today), "off_cm": off_cm(today, truth), "psnr": today.info["quality"].get("psnr")}
         row |= {"cpu": seconds, "new_cpu": start[1], "parts": today.info["seconds"]}
         row |= left(before, today, truth) if given.unlabelled else {}
