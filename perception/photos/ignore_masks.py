@@ -19,6 +19,9 @@ from perception.photos.lens import same_aspect
 from perception.photos.named_files import NamedFiles
 from perception.types import Scene, View
 
+LEAST_USED = 1e-3
+"""Share of the pixels from which a photo says something: fewer may all be lost when it is made smaller."""
+
 
 def mask_of(folder: Path | None, name: str) -> Path | None:
     """The mask of photo `name` in `folder`: "a/1.png" or "a/1.jpg.png" for "a/1.jpg"; None without one."""
@@ -74,7 +77,7 @@ def stage_masks(
 
 
 def with_checked_masks(scene: Scene, folder: Path | None) -> Scene:
-    """The scene without the photos that their masks ignore completely, and a note on what is ignored.
+    """The scene without the photos of which their masks leave under LEAST_USED, and a note on what is ignored.
     folder: of masks, as the user named it. InputError when it holds none for these photos, a mask is unreadable, or
     nothing is left."""
     masked = [view for view in scene.views if view.mask is not None]
@@ -86,13 +89,14 @@ def with_checked_masks(scene: Scene, folder: Path | None) -> Scene:
     if not masked:
         return scene
     weights = ((view.name, load_weight(view, view.width, view.height)) for view in masked)
-    ignored = {name: 1.0 - float(weight.mean()) for name, weight in weights if weight is not None}
-    views = [view for view in scene.views if ignored.get(view.name) != 1.0]
+    used = {name: float(weight.mean()) for name, weight in weights if weight is not None}
+    views = [view for view in scene.views if used.get(view.name, 1.0) >= LEAST_USED]
     if not views:
         raise InputError(f"{masked[0].mask}: this and all other masks are black (0 = ignored); are they inverted?")
-    black = [view for view in masked if ignored[view.name] == 1.0]
-    out = [{"name": view.name, "why": f"{view.mask}: ignores every pixel"} for view in black]
-    share = float(np.mean(list(ignored.values())))
+    black = [view for view in masked if used[view.name] < LEAST_USED]
+    what = {view.name: f"all but {used[view.name]:.1g} of the" if used[view.name] else "all" for view in black}
+    out = [{"name": view.name, "why": f"{view.mask}: ignores {what[view.name]} pixels"} for view in black]
+    share = 1.0 - float(np.mean(list(used.values())))
     note = f"masks: {share:.1%} of the pixels of {len(masked)} of {len(scene.views)} photos are ignored"
     facts = {"notes": [*scene.report.get("notes", []), note], "left_out": [*scene.report.get("left_out", []), *out]}
     return replace(scene, views=views, report={**scene.report, **facts})
