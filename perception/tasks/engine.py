@@ -21,6 +21,7 @@ from perception.progress import Progress
 
 CONNECT = 10.0  # seconds in which a cluster must answer
 RETRIES = 5  # how often a task is run again whose worker was lost
+_TOKENS = {"RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"}
 _CHILD = """import sys
 sys.path[:] = sys.argv[4:]
 from importlib import import_module
@@ -30,6 +31,12 @@ try:
 except InputError as error:
     sys.exit(str(error))
 """
+
+
+def _show_token() -> None:
+    """Has Ray show the token of this machine, if there is one, for which clusters ask since 2.60. Before its import."""
+    if _TOKENS & os.environ.keys() or (Path.home() / ".ray" / "auth_token").is_file():
+        os.environ.setdefault("RAY_AUTH_MODE", "token")
 
 
 def _join(ray: Any, address: str | None) -> None:
@@ -87,6 +94,7 @@ class Engine:
     def _on_ray(
         self, task: Callable[..., Any], items: Sequence[str], what: str, progress: Progress, each_core: bool
     ) -> list[Any]:
+        _show_token()
         try:
             import ray
         except ImportError as error:

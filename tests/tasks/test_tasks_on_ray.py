@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import tempfile
 from importlib.util import find_spec
@@ -49,6 +50,28 @@ def test_a_cluster_of_another_version_is_told(monkeypatch: pytest.MonkeyPatch) -
         engine = Engine("ray", f"127.0.0.1:{server.getsockname()[1]}")
         with pytest.raises(InputError, match=r"no Ray cluster there \(Version mismatch: .* Ray: 2\.0 Python: 3\.10\.1"):
             engine.run(print, ["a"], "task", QUIET)
+
+
+@pytest.mark.parametrize(("token", "mode"), [(True, "token"), (False, None)])
+def test_the_token_of_this_machine_is_shown(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, token: bool, mode: str | None
+) -> None:
+    """`ray start --head` asks for it where there is one, and Ray 2.60 leaves one at every cluster of its own."""
+    import ray
+
+    def init(*_: object, **__: object) -> None:
+        raise RuntimeError(f"mode {os.environ.get('RAY_AUTH_MODE')}")
+
+    monkeypatch.setattr(ray, "init", init)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"):
+        monkeypatch.setenv(name, "")  # so that it is put back
+        monkeypatch.delenv(name)
+    if token:
+        (tmp_path / ".ray").mkdir()
+        (tmp_path / ".ray" / "auth_token").write_text("secret")
+    with socket.create_server(("127.0.0.1", 0)) as server, pytest.raises(InputError, match=f"mode {mode}"):
+        Engine("ray", f"127.0.0.1:{server.getsockname()[1]}").run(print, ["a"], "task", QUIET)
 
 
 @pytest.mark.slow
