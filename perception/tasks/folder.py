@@ -67,13 +67,14 @@ def read_task(folder: Path) -> tuple[Scene, dict[str, Any]]:
 def leaves_result(work: Work) -> Callable[..., None]:
     """The task (folder, progress) of `run_tasks` that does `work` and leaves RESULT; nothing where that is there."""
 
-    @functools.wraps(work)
     def task(folder: str, progress: Progress = QUIET) -> None:
         facts, result = read_facts(Path(folder)), Path(folder) / RESULT
         if not result.is_dir():
             with atomic_directory(result) as new:
                 work(Path(folder), facts, new, progress)
 
+    functools.update_wrapper(task, work)
+    del task.__dict__["__wrapped__"]  # by it, Ray asks for the arguments of `work`
     return task
 
 

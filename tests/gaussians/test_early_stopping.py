@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 
-from perception.cli import _resume, main
+from perception.cli import _interrupted, main
 from perception.config import PAPER, load_config
 from perception.gaussians import optimiser, schedule
 from perception.gaussians.early_stopping import COST_EXPONENT, EarlyStopping
@@ -135,7 +135,8 @@ def test_the_record_accounts_for_the_time(
     assert main(["info", str(out)]) == 0
     told = capsys.readouterr().out
     assert f"({training['pairs'] / training['seconds'] / 1e6:.1f} M pairs/s)" in told and "rasterizer backward" in told
-    assert _resume([*words]).endswith("--resume") and _resume(["query", "m", "a b"]) == "perception query m 'a b'"
+    assert _interrupted([*words]).endswith("--resume")
+    assert _interrupted(["query", "m", "a b"]) == "interrupted; begin again with: perception query m 'a b'"
 
 
 def small_trainer(*pairs: str) -> Trainer:
