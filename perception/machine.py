@@ -9,6 +9,7 @@ import os
 import resource
 import shutil
 import sys
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -27,6 +28,7 @@ LEAST_DISK = 256 << 20
 PHOTO_DISK = 1 << 20
 """Bytes of a photo's features and matches there: .3 and .4 MiB at 640 × 480 and 540 × 960 pixels, more if left out."""
 _CGROUPS, _OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+_blas_lock, _blas_limit, _blas_blocks = threading.Lock(), contextlib.ExitStack(), list[None]()
 threads_before: ContextVar[int] = ContextVar("threads_before", default=0)
 """Threads that torch had outside `torch_on_one_thread`; 0 outside of it."""
 
@@ -76,6 +78,25 @@ def limit_threads() -> None:
     from perception import _core
 
     _core.training.set_threads(granted)
+
+
+@contextlib.contextmanager
+def blas_on_one_thread() -> Iterator[None]:
+    """Within it BLAS, as far as it is loaded, uses one thread: the last bits of NumPy's products depend on the number
+    of threads. The limit is the process's: it is set when the first block begins, and lifted when the last one ends."""
+    from threadpoolctl import threadpool_limits
+
+    with _blas_lock:
+        if not _blas_blocks:
+            _blas_limit.enter_context(threadpool_limits(1, "blas"))
+        _blas_blocks.append(None)
+    try:
+        yield
+    finally:
+        with _blas_lock:
+            _blas_blocks.pop()
+            if not _blas_blocks:
+                _blas_limit.close()
 
 
 @contextlib.contextmanager

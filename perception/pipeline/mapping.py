@@ -18,7 +18,7 @@ from perception.inputs.load import load_scene
 from perception.language.base import Encoder
 from perception.language.encoders import make_encoder
 from perception.language.ocr import TextReader, make_reader
-from perception.machine import return_free_memory
+from perception.machine import blas_on_one_thread, return_free_memory
 from perception.map.write import Map, write_map
 from perception.masks import MaskSource, make_source
 from perception.masks.compute import load_segmentation
@@ -39,6 +39,7 @@ from perception.tasks.engine import LOCAL, Engine
 from perception.types import Scene
 
 
+@blas_on_one_thread()
 def build_map(
     source: Path,
     output: Path,

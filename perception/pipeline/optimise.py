@@ -23,7 +23,7 @@ from perception.gaussians.stereo import with_stereo
 from perception.gaussians.train import Trainer
 from perception.gaussians.views import TrainingView, surface_depth
 from perception.io.memory import DiskArrays, Keep
-from perception.machine import memory_limit, return_free_memory
+from perception.machine import blas_on_one_thread, memory_limit, return_free_memory
 from perception.masks import MaskSource, compute_masks, make_source
 from perception.photos.decode import load_photo
 from perception.pipeline.checkpoint import TrainingObserver, digest, training_mark
@@ -190,6 +190,7 @@ def label_by_tasks(run: Run, views: Sequence[View], source: MaskSource) -> None:
         run.engine.run(label_task, [str(folder.resolve()) for folder in folders], "photo set", run.progress)
 
 
+@blas_on_one_thread()
 def label_task(folder: str, progress: Progress = QUIET) -> None:
     """Makes the label images of the photos whose task lies in `folder`, where they are missing or out of date."""
     scene, facts = read_task(Path(folder))

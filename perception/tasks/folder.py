@@ -13,6 +13,7 @@ from typing import Any
 
 from perception.errors import InputError
 from perception.io.atomic import atomic_directory, write_file
+from perception.machine import blas_on_one_thread
 from perception.photos.scene_file import load_saved_scene, save_scene
 from perception.progress import QUIET, Progress
 from perception.tasks.engine import Engine
@@ -70,7 +71,7 @@ def leaves_result(work: Work) -> Callable[..., None]:
     def task(folder: str, progress: Progress = QUIET) -> None:
         facts, result = read_facts(Path(folder)), Path(folder) / RESULT
         if not result.is_dir():
-            with atomic_directory(result) as new:
+            with blas_on_one_thread(), atomic_directory(result) as new:
                 work(Path(folder), facts, new, progress)
 
     functools.update_wrapper(task, work)

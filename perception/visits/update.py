@@ -30,7 +30,7 @@ from perception.inputs.load import photo_sizes
 from perception.instances.group import Grouping
 from perception.language.base import Encoder
 from perception.language.ocr import make_reader
-from perception.machine import peak_memory_mib
+from perception.machine import blas_on_one_thread, peak_memory_mib
 from perception.map.history import is_removed
 from perception.map.map import MAX_SIDE
 from perception.map.write import Map, read_map, write_map
@@ -59,6 +59,7 @@ from perception.visits.today import Today, seen_today
 from perception.visits.visit import Owned, Visit, open_visit
 
 
+@blas_on_one_thread()
 def update_map(
     path: Path,
     source: Path,

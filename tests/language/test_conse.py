@@ -76,7 +76,7 @@ def test_sentences_have_the_same_bits_for_any_number_of_threads() -> None:
         assert np.array_equal(sentences.encode(texts), expected)
 
 
-def test_threads_take_turns_with_the_limit_of_blas(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_share_the_limit_of_blas(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is the process's: one that overlaps another would restore the other's limit at its end, and keep it."""
     inside, most = list[int](), list[int]()
 
@@ -92,7 +92,7 @@ def test_threads_take_turns_with_the_limit_of_blas(monkeypatch: pytest.MonkeyPat
     sentences = MiniLM()
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(sentences.encode, [["mug"]] * 12))
-    assert most == [1] * 12
+    assert set(most) == {1} and not inside
 
 
 def test_damaged_weights_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
