@@ -33,8 +33,9 @@ except InputError as error:
 """
 
 
-def _show_token() -> None:
-    """Has Ray show the token of this machine, if there is one, for which clusters ask since 2.60. Before its import."""
+def _send_token() -> None:
+    """Has Ray send the token of this machine, if there is one: clusters of Ray 2.60 ask for it. Call it before Ray is
+    imported."""
     if _TOKENS & os.environ.keys() or (Path.home() / ".ray" / "auth_token").is_file():
         os.environ.setdefault("RAY_AUTH_MODE", "token")
 
@@ -94,7 +95,7 @@ class Engine:
     def _on_ray(
         self, task: Callable[..., Any], items: Sequence[str], what: str, progress: Progress, each_core: bool
     ) -> list[Any]:
-        _show_token()
+        _send_token()
         try:
             import ray
         except ImportError as error:

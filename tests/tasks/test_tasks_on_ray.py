@@ -53,7 +53,7 @@ def test_a_cluster_of_another_version_is_told(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize(("token", "mode"), [(True, "token"), (False, None)])
-def test_the_token_of_this_machine_is_shown(
+def test_the_token_of_this_machine_is_sent(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, token: bool, mode: str | None
 ) -> None:
     """`ray start --head` asks for it where there is one, and Ray 2.60 leaves one at every cluster of its own."""
