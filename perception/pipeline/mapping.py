@@ -39,7 +39,6 @@ from perception.tasks.engine import LOCAL, Engine
 from perception.types import Scene
 
 
-@blas_on_one_thread()
 def build_map(
     source: Path,
     output: Path,
@@ -62,7 +61,7 @@ def build_map(
     check_name(output)
     if resume and (made := finished(source, output, config, fingerprint(source, config), progress)) is not None:
         return made
-    with working(source, output, resume) as work:
+    with blas_on_one_thread(), working(source, output, resume) as work:
         # Files, models and devices are opened first, so that errors appear before hours of work.
         refuse_unnamed(hold_inputs(work, source, config, output), config)
         run = Run.begun(source, config, work, progress, engine)
