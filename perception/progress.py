@@ -1,15 +1,39 @@
-"""Progress of long computations: a bar on a terminal, plain log lines elsewhere, always on stderr; seconds by part."""
+"""What is said on stderr: progress of long computations, a bar on a terminal, log lines elsewhere; seconds by part."""
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TextIO
 
 LINE = "{desc}{percentage:3.0f}%{postfix}  {bar}"
 """Format of tqdm's line. tqdm's own rate and remaining time are omitted, as they are wrong for a resumed run."""
+
+
+def say(text: str) -> None:
+    """Prints one line on stderr at once."""
+    with outlasting(sys.stderr):
+        print(text, file=sys.stderr, flush=True)
+
+
+@contextmanager
+def outlasting(stream: TextIO) -> Iterator[None]:
+    """Around output that nobody may read any more: where its terminal or pipe is closed, or its disk full, this and all
+    later output of the stream is dropped, and the work goes on."""
+    try:
+        yield
+    except OSError:
+        mute(stream)
+
+
+def mute(stream: TextIO) -> None:
+    """Sends what is written to a standard stream to the null device, also what waits there for Python's end."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
 
 
 @contextmanager
@@ -41,17 +65,19 @@ class Progress:
         """Prints one line at once."""
         if self.quiet:
             return
-        if self._bar is not None:
-            self._bar.clear()
-        print(text, file=self.stream, flush=True)
+        with outlasting(self.stream):
+            if self._bar is not None:
+                self._bar.clear()
+            print(text, file=self.stream, flush=True)
 
     def update(self, stage: str, done: int, total: int, *figures: str) -> None:
         """Shows the state of a stage; without a terminal, prints a line every ten seconds and at the end."""
         if self.terminal:
-            self._draw(stage, done, total, figures)
+            with outlasting(self.stream):
+                self._draw(stage, done, total, figures)
         elif not self.quiet and (done >= total or time.monotonic() - self._last >= 10):
             self._last = time.monotonic()
-            print("  ".join([f"{stage}: {done}/{total}", *figures]), file=self.stream, flush=True)
+            self.log("  ".join([f"{stage}: {done}/{total}", *figures]))
 
     def _draw(self, stage: str, done: int, total: int, figures: tuple[str, ...]) -> None:
         from tqdm import tqdm
@@ -71,7 +97,8 @@ class Progress:
     def close(self) -> None:
         """Ends the bar, if there is one."""
         if self._bar is not None:
-            self._bar.close()
+            with outlasting(self.stream):
+                self._bar.close()
             self._bar = None
 
 

@@ -1,4 +1,4 @@
-"""What a person at a terminal sees of a run, and what Ctrl-C leaves: the program on a pseudo-terminal."""
+"""What a person at a terminal sees of a run, and what Ctrl-C leaves, on a pseudo-terminal; streams that end."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -108,3 +109,33 @@ def test_elsewhere_than_on_a_terminal_whole_lines(capsys: pytest.CaptureFixture[
     for done in range(3):
         progress.update("masks", done, 2, "a", "b")
     assert capsys.readouterr().err.splitlines()[-1] == "masks: 2/2  a  b"
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_work_goes_on_when_nobody_reads_what_it_says(terminal: bool) -> None:
+    code = (
+        "import sys; from perception.progress import Progress, say\n"
+        "with Progress() as progress:\n"
+        "    print(progress.terminal, flush=True); sys.stdin.readline()\n"
+        "    progress.log('a'); progress.update('b', 1, 2); progress.update('b', 2, 2); progress.log('c')\n"
+        "say('d'); print('done')\n"
+    )
+    reader, writer = pty.openpty() if terminal else os.pipe()
+    streams: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": writer, "text": True}
+    work = subprocess.Popen([sys.executable, "-c", code], **streams)
+    os.close(writer)
+    assert work.stdout is not None
+    assert work.stdout.readline() == f"{terminal}\n"
+    os.close(reader)
+    assert (work.communicate("\n", 60)[0], work.returncode) == ("done\n", 0)
+
+
+def test_closed_streams_are_not_written_to_files(tmp_path: Path) -> None:
+    code = (
+        "import os, sys; from perception.cli import main\n"
+        "code = main(['info', 'nothing']); file = open('file', 'wb')\n"
+        "os.write(2, b'of a library'); print(code, file.fileno() > 2)\n"
+    )
+    closed = ["sh", "-c", 'exec "$@" 2>&-', "sh", sys.executable, "-c", code]
+    done = subprocess.run(closed, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=True)
+    assert (done.stdout, (tmp_path / "file").read_bytes()) == ("2 True\n", b"")

@@ -12,12 +12,14 @@ import threading
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import NoReturn
 
 from perception import __version__
 from perception.cli.parser import Parser
 from perception.errors import InputError
 from perception.machine import limit_threads
+from perception.progress import mute, say
 
 _MODULES = ("mapping", "maps", "scoring", "serving", "models")
 """Files of this package that add subcommands, in the order of --help."""
@@ -48,7 +50,16 @@ def _interrupted(argv: Sequence[str] | None) -> str:
 
 
 def _warn(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
-    print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
+    say(f"warning: {' '.join(str(message).split())}")
+
+
+def _open_streams() -> None:
+    """Gives a closed standard stream, as of some daemons, the null device: a file that is opened later would get its
+    number, and in it what libraries print; and Python would print on stdout what is meant for stderr."""
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(number, True)
+    os.close(number)
+    sys.stdout, sys.stderr = (stream or Path(os.devnull).open("w") for stream in (sys.stdout, sys.stderr))  # noqa: SIM115
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -56,6 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Threads of torch's OpenMP that spin while they wait would take the cores from the kernels' own threads.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     limit_threads()
+    _open_streams()
     args = argparse.Namespace()
     warnings.showwarning = _warn  # type: ignore[assignment]
     if isinstance(sys.stdout, io.TextIOWrapper):  # not every path can be written as UTF-8
@@ -68,10 +80,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except InputError as error:
         return _refused(error)
     except KeyboardInterrupt:
-        print(getattr(args, "interrupted", _interrupted(argv)), file=sys.stderr)
+        say(getattr(args, "interrupted", _interrupted(argv)))
         return 130
-    except BrokenPipeError:
-        return 0
     except OSError as error:  # a path that the system refuses, wherever it is used first
         if error.filename is None or error.strerror is None:
             raise
@@ -96,14 +106,14 @@ def _answer(text: str) -> None:
     """Prints the answer. InputError where it cannot be written."""
     try:
         print(text, flush=True)
-    except BrokenPipeError:
-        raise
+    except BrokenPipeError:  # the reader has what it wants
+        mute(sys.stdout)
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else the same error at the end of Python
+        mute(sys.stdout)
         raise InputError(f"the answer cannot be written: {error.strerror}; make space for it") from error
 
 
 def _refused(error: InputError) -> int:
     """Prints an error as one line; the exit code."""
-    print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+    say(f"error: {' '.join(str(error).split())}")
     return 2

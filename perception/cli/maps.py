@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
 from perception.cli.parser import command, map_command
 from perception.errors import InputError, visible
-from perception.progress import Progress
+from perception.progress import Progress, outlasting
 
 
 def register(commands: Any) -> None:
@@ -274,7 +275,8 @@ def _localise(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         facts, lines = localise_photos(args.map, args.new, args.output, args.photos, args.camera, progress)
     if not any(photo["localised"] for photo in facts["photos"]):
         if args.json:
-            print(json.dumps(facts, allow_nan=False))
+            with outlasting(sys.stdout):
+                print(json.dumps(facts, allow_nan=False), flush=True)
         first, gone = facts["photos"][0], len(facts["rendered"])
         found = f"none of {len(facts['photos'])} photos: {first['name']}: {first['why']}"
         todo = f"; {gone} photos of the map are not at hand and were rendered: --photos DIR gives their folder"

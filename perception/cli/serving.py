@@ -8,7 +8,7 @@ from typing import Any
 
 from perception.cli.parser import map_command
 from perception.errors import InputError
-from perception.progress import Progress
+from perception.progress import Progress, say
 
 
 def register(commands: Any) -> None:
@@ -103,7 +103,6 @@ def _node(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _view(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    import sys
     import threading
 
     from perception.serve.listening import read_token
@@ -116,10 +115,10 @@ def _view(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     shown = viewer.url if token is None else f"{viewer.address}/?token=CONTENT-OF-{args.token_file.name}"
     hint = f"; over SSH: ssh -L {port}:localhost:{port} THIS-MACHINE, then open it there"
     try:
-        print(f"{args.map}: open {shown} in a browser{hint}. Ctrl-C ends.", file=sys.stderr, flush=True)
+        say(f"{args.map}: open {shown} in a browser{hint}. Ctrl-C ends.")
         threading.Event().wait()
     except KeyboardInterrupt:
         viewer.stop()
         if viewer.session.editor.dirty:
-            print("warning: the last corrections were not saved", file=sys.stderr)
+            say("warning: the last corrections were not saved")
     return {"url": viewer.address}, ""

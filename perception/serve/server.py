@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import importlib.util
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from perception.errors import missing_extra
 from perception.language.base import Encoder
+from perception.progress import say
 from perception.serve.engine import QueryEngine
 from perception.serve.listening import check_address, listen, url_host
 from perception.serve.requests import ServeSettings
@@ -47,9 +47,9 @@ def serve(
         listen(settings.host, settings.port) as sock,
         QueryEngine(path, encoders=encoders, **settings.of_engine()) as engine,
     ):
-        _say(f"serving {path} at http://{url_host(settings.host)}:{sock.getsockname()[1]}{page} (Ctrl-C stops)")
+        say(f"serving {path} at http://{url_host(settings.host)}:{sock.getsockname()[1]}{page} (Ctrl-C stops)")
         if (trouble := engine.current.problem) is not None:
-            _say(f"warning: prompts cannot be answered: {trouble}")
+            say(f"warning: prompts cannot be answered: {trouble}")
         config = uvicorn.Config(
             build(engine, settings),
             http=timed_protocol(settings.timeout, _TOTAL_TIMEOUT),
@@ -60,10 +60,6 @@ def serve(
             timeout_graceful_shutdown=max(1, round(settings.timeout)),
         )
         uvicorn.Server(config).run(sockets=[sock])
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
 
 
 def timed_protocol(header: float, total: float) -> type[asyncio.Protocol]:
