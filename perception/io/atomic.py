@@ -93,10 +93,13 @@ def aside(
     try:
         if path.exists() and not path.is_file() and not path.is_dir():
             raise InputError(f"{path}: is a pipe, a socket or a device, which stays as it is; give another path")
+        if path.exists() and not path.stat().st_mode & 0o222:  # a rename would replace it nevertheless
+            raise InputError(f"{path}: is read-only, so it is kept; give another path, or allow writing (chmod u+w)")
         recover(path, discard)
         with _locked(temporary, lambda: make(temporary)):
             yield temporary
             for file in (*temporary.rglob("*"), temporary):
+                _keep_rights(path / file.relative_to(temporary), file)
                 _sync(file)
             old = put(temporary, path)
             _sync(path)
@@ -230,12 +233,23 @@ def _sibling(path: Path, kind: str) -> Path:
     return path.with_name(f".{path.name}.{kind}-{os.getpid()}-{uuid4().hex[:8]}")
 
 
+def _keep_rights(old: Path, new: Path) -> None:
+    """Gives `new` the rights, the group and, for root, the owner of `old`, if that is there."""
+    with contextlib.suppress(OSError):  # it is not there, or the file system has no rights
+        facts = old.stat()
+        for owner in (facts.st_uid, -1):
+            with contextlib.suppress(OSError):  # of another user, or a group of others
+                os.chown(new, owner, facts.st_gid)
+                break
+        new.chmod(facts.st_mode & 0o7777)
+
+
 def _sync(path: Path) -> None:
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # some file systems cannot sync a folder
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.EBADF):  # not all can sync a folder
             raise
     finally:
         os.close(descriptor)

@@ -224,3 +224,36 @@ def test_where_there_are_no_locks_is_written_with_a_warning(gmap: Path, monkeypa
     with pytest.warns(UserWarning, match="has no locks"):
         set_labels(gmap, {0: "mug"})
     assert read_map(gmap).instances[0]["label"] == "mug"
+
+
+@pytest.mark.parametrize("writer", ["label", "save"])
+@pytest.mark.parametrize("mode", [0o600, 0o664])
+def test_rights_and_group_outlive_writers(gmap: Path, mode: int, writer: str) -> None:
+    files, folder = sorted(gmap.iterdir()), mode | 0o2110
+    group = 12345 if os.geteuid() == 0 else os.getegid()
+    for file in (*files, gmap):
+        os.chown(file, -1, group)
+        file.chmod(folder if file == gmap else mode)
+    if writer == "label":
+        set_labels(gmap, {0: "mug"})
+    else:
+        write_map(gmap, read_map(gmap))
+    for file in (*files, gmap):
+        found = file.stat()
+        assert (oct(found.st_mode & 0o7777), found.st_gid) == (oct(folder if file == gmap else mode), group), file
+
+
+@pytest.mark.parametrize("name", ["", "map.json", "notes.ply"])
+def test_what_is_read_only_is_kept(gmap: Path, name: str) -> None:
+    (gmap / "notes.ply").write_text("note")
+    kept = gmap / name
+    kept.chmod(kept.stat().st_mode & ~0o222)
+    before = {file.name: file.read_bytes() for file in gmap.iterdir()}
+    with pytest.raises(InputError, match=f"{kept.name}: is read-only"):
+        if name == "map.json":
+            set_labels(gmap, {0: "mug"})
+        elif name:
+            atomic.write_file(kept, "other")
+        else:
+            write_map(gmap, read_map(gmap))
+    assert before == {file.name: file.read_bytes() for file in gmap.iterdir()}
