@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
 import shlex
 from pathlib import Path
@@ -64,6 +65,12 @@ def local_path(text: str) -> Path:
     if "\0" in text:
         raise InputError(f"{text}: holds a NUL character; expected a path")
     return Path(text)
+
+
+def home_path(text: str) -> Path:
+    """The path that `text` names, "~" at its beginning for a user's home; as it is where that is not known, as in a
+    container without one."""
+    return Path(os.path.expanduser(text))  # noqa: PTH111 - Path.expanduser raises RuntimeError then
 
 
 def refuse_named_pipe(file: Path) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from perception.errors import InputError, missing_extra
+from perception.errors import InputError, home_path, missing_extra
 from perception.io.atomic import atomic_directory
 from perception.io.documents import brief
 from perception.map.checksums import facts_of, sha256
@@ -27,7 +27,7 @@ def check_file(file: str) -> dict[str, Any]:
     """Describes an ONNX file, a folder of them or a stored model: `describe_graph` of each under "files", and warnings.
     InputError when a file is not an ONNX model, and for a SAM encoder and decoder that do not fit together."""
     stored = find_model(file)
-    path = stored.folder if stored and not Path(file).exists() else Path(file).expanduser()
+    path = stored.folder if stored and not Path(file).exists() else home_path(file)
     left_out: list[Path] = []
     if path.is_dir():
         graphs, left_out = model_graphs(path)
@@ -174,7 +174,7 @@ def _fetched(entry: Entry, path: str, folder: Path) -> tuple[str, Path, str]:
 
 def _local(source: str) -> list[tuple[str, Path, str]]:
     """(file name, path, source) of a file with its side files, or of the files of a folder."""
-    path = Path(source).expanduser()
+    path = home_path(source)
     if path.is_dir():
         root, graphs = model_root(path), model_graphs(path)[0]
         for graph in graphs:

@@ -15,7 +15,7 @@ import pytest
 
 from perception import models
 from perception.cli import main
-from perception.errors import InputError
+from perception.errors import InputError, home_path
 from perception.masks import make_source
 from perception.models import add_model, check_file, get_model
 from perception.onnx.store import Entry, StoredModel, catalogue, find_model, models_folder
@@ -271,3 +271,15 @@ def test_the_command_line(sam: tuple[Path, Path], capsys: pytest.CaptureFixture[
     assert "runs on CPUExecutionProvider" in capsys.readouterr().out
     assert main(["models", "check", "nowhere"]) == 2
     assert "the store holds tiny" in capsys.readouterr().err
+
+
+def test_a_user_without_a_home(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unknown(_: object) -> None:
+        raise KeyError
+
+    for name in ("HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    for name in ("getpwuid", "getpwnam"):
+        monkeypatch.setattr(f"pwd.{name}", unknown)
+    assert models_folder() == Path("/.cache/perception/models")
+    assert [str(home_path(text)) for text in ("~", "~other/x", "a")] == ["~", "~other/x", "a"]

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from perception.errors import InputError
+from perception.errors import InputError, home_path
 from perception.io.documents import refusing
 from perception.language.base import Reading, check_images, check_texts, unit_rows
 from perception.language.preprocess import CLIP_FAMILY, Family, family_of, find_preprocess
@@ -113,7 +113,7 @@ class ClipEncoder:
         """From "IMAGE.onnx,TEXT.onnx", "BOTH.onnx", a folder with files of the usual names, or a stored model name."""
         with refusing(f"clip:{argument}: a file beside the model is not understood ({{why}}); fetch it again"):
             argument = resolve(argument)
-            parts = [Path(part.strip()).expanduser() for part in argument.split(",")]
+            parts = [home_path(part.strip()) for part in argument.split(",")]
             if len(parts) == 2:
                 return cls(parts[0], parts[1])
             if len(parts) == 1 and parts[0].is_dir():

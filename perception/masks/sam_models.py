@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from perception.errors import InputError
+from perception.errors import InputError, home_path
 from perception.onnx import sessions
 from perception.onnx.store import known_names, resolve
 
@@ -236,7 +236,7 @@ def open_sam(spec: str, threads: int = 0) -> SamModel:
     """spec: a folder with both graphs, an encoder file next to its decoder, `ENCODER,DECODER`, or a stored name.
     threads: of one run; 0: all cores."""
     spec = resolve(spec)
-    paths = [Path(part.strip()) for part in spec.split(",")] if "," in spec else sam_graphs(Path(spec).expanduser())
+    paths = [home_path(part.strip()) for part in spec.split(",")] if "," in spec else sam_graphs(home_path(spec))
     graphs = [open_graph(path, threads) for path in paths]
     encoders, decoders = [g for g in graphs if g.is_encoder], [g for g in graphs if g.is_decoder]
     if len(encoders) == 1 and len(decoders) == 1:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from perception.errors import InputError
+from perception.errors import InputError, home_path
 from perception.io.documents import read_json
 
 RECORD = "perception.json"
@@ -48,8 +48,10 @@ def catalogue() -> dict[str, Entry]:
 
 
 def cache_folder() -> Path:
-    """Folder for cached files and models: $XDG_CACHE_HOME/perception or ~/.cache/perception."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "perception"
+    """Folder for cached files and models: $XDG_CACHE_HOME/perception or ~/.cache/perception; /.cache/perception, where
+    nothing can be kept, for a user without a home, as of a container."""
+    home = Path("/", str(home_path("~")).removeprefix("~"))
+    return Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache") / "perception"
 
 
 def models_folder() -> Path:
@@ -79,7 +81,7 @@ def find_model(name: str) -> StoredModel | None:
 
 def resolve(spec: str) -> str:
     """`spec` itself if it is an existing path, else the folder of the stored model of that name, else `spec`."""
-    if Path(spec).expanduser().exists():
+    if home_path(spec).exists():
         return spec
     model = find_model(spec)
     return spec if model is None else str(model.folder)

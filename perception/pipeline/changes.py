@@ -12,7 +12,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from perception.config import MapConfig
-from perception.errors import InputError
+from perception.errors import InputError, home_path
 from perception.inputs.load import input_files
 from perception.io.atomic import write_file
 from perception.io.documents import read_json, refusing
@@ -83,7 +83,7 @@ def _named(source: Path, config: MapConfig, frames: Path) -> Iterator[tuple[str,
     encoder, _, clip = config.language.encoder.partition(":")
     for setting, model in (("masks", sam), ("language.encoder", clip if encoder == "clip" else "")):
         for part in resolve(model).split(",") if model else ():
-            path = Path(part.strip()).expanduser().absolute()
+            path = home_path(part.strip()).absolute()
             yield setting, path, _model_files(path)
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from perception.errors import InputError, missing_extra
+from perception.errors import InputError, home_path, missing_extra
 from perception.io.documents import brief
 from perception.machine import cores
 from perception.progress import Progress
@@ -36,7 +36,7 @@ except InputError as error:
 def _send_token() -> None:
     """Has Ray send the token of this machine, if there is one: clusters of Ray 2.60 ask for it. Call it before Ray is
     imported."""
-    if _TOKENS & os.environ.keys() or (Path.home() / ".ray" / "auth_token").is_file():
+    if _TOKENS & os.environ.keys() or home_path("~/.ray/auth_token").is_file():
         os.environ.setdefault("RAY_AUTH_MODE", "token")
 
 
