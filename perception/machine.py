@@ -117,6 +117,16 @@ def torch_on_one_thread() -> Iterator[None]:
         threads_before.reset(token)
 
 
+def _torch_in_a_fork() -> None:
+    """A forked process has none of the threads that torch's OpenMP would wait for; on one thread it needs none."""
+    if (torch := sys.modules.get("torch")) is not None:
+        torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_torch_in_a_fork)
+
+
 def memory_limit() -> int | None:
     """Bytes of memory that this process may ever have: the machine's, or its control groups'; None if unknown."""
     try:

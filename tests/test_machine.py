@@ -1,6 +1,8 @@
 """Cores and memory that control groups grant, versions 1 and 2, on folders as the kernel shows them; threads."""
 
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -131,3 +133,15 @@ def test_products_have_the_same_bits_for_any_number_of_threads() -> None:
                 pass
             assert np.array_equal(rows @ rows.T, expected)
         assert {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"} == {2}
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the system has no forks")
+def test_a_forked_process_computes() -> None:
+    code = (
+        "import os, signal, torch, perception.machine\n"
+        "double = lambda: (torch.ones(1 << 20) * 2).sum()\n"
+        "torch.set_num_threads(2); double()\n"
+        "if not (child := os.fork()):\n    signal.alarm(20); os._exit(int(double() != 2 << 20))\n"
+        "assert os.waitpid(child, 0)[1] == 0 and torch.get_num_threads() == 2\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
+from codecs import BOM_UTF8
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -186,6 +187,8 @@ def _read_facts(path: Path) -> tuple[dict[str, Any], bytes]:
     file = path / FACTS
     if (path / STORE).is_file():
         raise InputError(f"{path}: is a store of many maps, and this needs one map; give one of them")
+    if path.is_file():
+        raise InputError(f"{path}: is a file, expected the folder of a map (NAME.gsmap); give that, unpacked")
     if not file.is_file():
         raise InputError(f"{path}: is no map (no map.json inside); give a directory made by `perception map`")
     try:
@@ -213,8 +216,13 @@ def _read_facts(path: Path) -> tuple[dict[str, Any], bytes]:
 def _read_instances(file: Path, facts: dict[str, Any]) -> tuple[list[dict[str, Any]], bytes]:
     with _damage_in(file):
         raw = file.read_bytes()
-        value = parsed(raw)
-        check_instances(value, facts)
+        try:
+            value = parsed(raw.removeprefix(BOM_UTF8))  # of an editor
+            check_instances(value, facts)
+        except ValueError as error:
+            if facts.get("files", {}).get(EDITABLE, {}).get("sha256") == hashlib.sha256(raw).hexdigest():
+                raise
+            raise InputError(f"{file}: {error}; it was edited or is damaged: mend it, or copy it anew") from error
     return value["instances"], raw
 
 

@@ -175,7 +175,18 @@ def test_instances_that_make_no_sense_are_told(copied: Path, text: str, words: s
     (copied / "instances.json").write_text(text)
     with pytest.raises(InputError) as error:
         perception.load_map(copied)
-    one_line(error, "instances.json", words)
+    one_line(error, "instances.json", words, "mend it")
+
+
+def test_a_byte_order_mark_of_an_editor_is_read(copied: Path) -> None:
+    file, whole = copied / "instances.json", perception.load_map(copied).instances
+    file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
+    assert perception.load_map(copied).instances == whole
+
+
+def test_a_file_in_place_of_a_map_is_told(copied: Path) -> None:
+    with pytest.raises(InputError, match="is a file, expected the folder of a map"):
+        perception.load_map(copied / "map.json")
 
 
 def test_numbers_that_are_none_and_repeated_ids_are_told(copied: Path) -> None:
