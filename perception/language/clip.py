@@ -28,6 +28,7 @@ from perception.onnx.sessions import (
     open_session,
     provider_warning,
     read_config,
+    run_graph,
     shape_of,
     signature,
 )
@@ -67,17 +68,19 @@ class ClipEncoder:
         shape = shape_of(self._pixels)
         self.preprocess = find_preprocess(image, shape[1] if shape[-1] == 3 else shape[2])
         self.dim = shape_of(self._text_output)[-1] or self._run_text(["a"]).shape[1]
-        of_images = shape_of(self._image_output)[-1] or self.dim
-        if of_images != self.dim:
-            raise InputError(
-                f"{image}: its embeddings have {of_images} numbers, those of {text} {self.dim}; "
-                "take both towers from one model"
-            )
+        self._check_length(shape_of(self._image_output)[-1] or self.dim)
         config = read_config(image, "config.json")
         stated = config.get("embed_dim") or (None if self.family.pooled else config.get("projection_dim"))
         if stated not in (None, self.dim):
             raise InputError(
                 f"{image}: its embeddings have {self.dim} numbers, config.json states {stated}; export with projection"
+            )
+
+    def _check_length(self, of_images: int) -> None:
+        if of_images != self.dim:
+            raise InputError(
+                f"{self._image_path}: its embeddings have {of_images} numbers, those of {self._text_path} {self.dim}; "
+                "take both towers from one model"
             )
 
     @cached_property
@@ -141,6 +144,7 @@ class ClipEncoder:
                 batch = batch.transpose(0, 2, 3, 1)
             feed: dict[str, np.ndarray] = {self._pixels.name: _padded(batch, fixed)}
             rows.append(self._answers(self._image, [self._image_output.name], feed)[0][: len(batch)])
+            self._check_length(rows[-1].shape[1])
         return unit_rows(np.concatenate(rows))
 
     def encode_texts(self, texts: Sequence[str]) -> np.ndarray:
@@ -170,7 +174,8 @@ class ClipEncoder:
                 ids, mask = self._tokenizer(["a"] * (shape[0] or 1))
                 feed[value.name] = mask if "mask" in value.name else ids
             feed[value.name] = feed[value.name].astype(dtype_of(value), copy=False)
-        return [np.asarray(output, np.float32) for output in session.run(outputs, feed)]
+        path = self._image_path if session is self._image else self._text_path
+        return [output.astype(np.float32, copy=False) for output in run_graph(path, session, outputs, feed)]
 
 
 def _find_pair(folder: Path) -> tuple[Path, Path]:

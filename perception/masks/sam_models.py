@@ -90,7 +90,7 @@ class Graph:
         }
         options = onnxruntime.RunOptions()
         options.only_execute_path_to_fetches = True  # no masks at the photo's size when those at low resolution do
-        results = self.session.run(list(self.outputs.values()), feeds, options)
+        results = sessions.run_graph(self.path, self.session, list(self.outputs.values()), feeds, options)
         return dict(zip(self.outputs, results, strict=True))
 
 
@@ -152,10 +152,9 @@ class SamModel:
         for count in (2, 1)[fixed == 1 :]:
             try:
                 _, iou = self._decode(empty, points[:count])
-            except Exception as error:  # onnxruntime's exceptions share no public base class
+            except ValueError as error:
                 if count == 1:
-                    first = str(error).splitlines()[0][:200]
-                    raise InputError(f"{self.decoder.path}: a point prompt fails ({first}); export it anew") from error
+                    raise InputError(f"{self.decoder.path}: a point prompt fails ({error}); export it anew") from error
                 continue
             if iou.shape[1] == 1:
                 self.warnings.append(

@@ -13,7 +13,7 @@ import numpy as np
 
 from perception.errors import InputError, missing_extra
 from perception.interrupts import uninterrupted
-from perception.io.documents import read_json
+from perception.io.documents import brief, read_json
 
 _DTYPES: dict[str, type] = {
     "tensor(float)": np.float32,
@@ -133,6 +133,22 @@ def open_session(path: Path, threads: int = 0) -> Any:
         if path.open("rb").read(40).startswith(b"version https://git-lfs"):
             raise InputError(f"{path}: a Git LFS pointer, not the model; fetch it with git lfs pull") from error
         raise InputError(f"{path}: not an ONNX model that onnxruntime can open ({first})") from error
+
+
+def run_graph(
+    path: Path, session: Any, outputs: list[str], feeds: dict[str, np.ndarray], options: Any = None
+) -> list[np.ndarray]:
+    """The outputs of one run of the model of `path`. InputError where it fails, as on a size that was fixed when it was
+    exported, and for NaN, as of half precision that overflows."""
+    try:
+        found = [np.asarray(output) for output in session.run(outputs, feeds, options)]
+    except Exception as error:  # onnxruntime's exceptions share no public base class
+        shapes = ", ".join(f"{name}{list(value.shape)}" for name, value in feeds.items())
+        raise InputError(f"{path}: fails on {shapes} ({brief(error, 200)}); export it anew") from error
+    for name, output in zip(outputs, found, strict=True):
+        if output.dtype.kind == "f" and np.isnan(output).any():
+            raise InputError(f"{path}: its output {name} holds NaN; take the model in full precision (fp32)")
+    return found
 
 
 def wanted_providers() -> list[str]:

@@ -105,7 +105,7 @@ def _open_models(run: Run) -> tuple[MaskSource, Encoder | None, TextReader | Non
     config, encoder = run.config, None
     masks, spec = make_source(config.masks, config.sam), config.language.encoder
     try:
-        encoder = make_encoder(spec)
+        encoder = make_encoder(spec, pictures=True)
     except InputError as error:
         if spec != "auto":
             raise

@@ -45,7 +45,9 @@ class _Tower(torch.nn.Module):
         return found if torch.is_tensor(found) else found.pooler_output
 
 
-def _export(module: Any, example: Any, path: Path, inputs: list[str], outputs: list[str]) -> None:
+def _export(
+    module: Any, example: Any, path: Path, inputs: list[str], outputs: list[str], axes: dict | None = None
+) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.onnx.export(
@@ -54,7 +56,7 @@ def _export(module: Any, example: Any, path: Path, inputs: list[str], outputs: l
             str(path),
             input_names=inputs,
             output_names=outputs,
-            dynamic_axes={name: {0: "batch"} for name in [*inputs, *outputs]},
+            dynamic_axes=axes or {name: {0: "batch"} for name in [*inputs, *outputs]},
             opset_version=17,
             dynamo=False,
         )
@@ -387,6 +389,27 @@ def test_bad_models_are_told_in_one_line(clip_folder: tuple[Path, Any], tmp_path
     (tmp_path / "preprocessor_config.json").write_text(json.dumps(CLIP_PREPROCESSOR))
     with pytest.raises(InputError, match=r"have 8 numbers.*16; take both towers from one model"):
         ClipEncoder(narrow, text)
+
+
+@pytest.mark.parametrize(
+    ("side", "dim", "weight", "told"),
+    [
+        (SIDE, 8, 1.0, "its embeddings have 8 numbers, those of .* 16; take both towers from one model"),
+        (SIDE // 2, 16, 1.0, rf"fails on pixel_values\[1, 3, {SIDE}, {SIDE}\] .*export it anew"),
+        (SIDE, 16, float("nan"), "its output image_embeds holds NaN; take the model in full precision"),
+    ],
+)
+def test_a_graph_that_only_claims_to_take_any_picture_is_told_before_work(
+    clip_folder: tuple[Path, Any], tmp_path: Path, side: int, dim: int, weight: float, told: str
+) -> None:
+    tower = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3 * side * side, dim))
+    torch.nn.init.constant_(tower[1].weight, weight)
+    axes = {"pixel_values": {0: "batch", 2: "height", 3: "width"}, "image_embeds": {0: "batch", 1: "dim"}}
+    loose = tmp_path / "loose.onnx"
+    _export(tower, torch.zeros(1, 3, side, side), loose, ["pixel_values"], ["image_embeds"], axes)
+    (tmp_path / "preprocessor_config.json").write_text(json.dumps(CLIP_PREPROCESSOR))
+    with pytest.raises(InputError, match=rf"loose\.onnx: {told}"):
+        make_encoder(f"clip:{loose},{clip_folder[0] / 'text_model.onnx'}", pictures=True)
 
 
 @pytest.mark.parametrize(

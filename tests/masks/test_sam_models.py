@@ -249,3 +249,18 @@ def test_two_decoders_in_a_folder(tmp_path):
     (tmp_path / "other_decoder.onnx").write_bytes((tmp_path / "decoder.onnx").read_bytes())
     with pytest.raises(InputError, match=r"found decoder\.onnx: decoder; .*other_decoder\.onnx: decoder; put"):
         open_sam(str(tmp_path))
+
+
+@pytest.mark.parametrize("broken", ["encoder", "decoder"])
+def test_models_that_fail_or_overflow_are_told(tmp_path, broken):
+    write_layout(tmp_path, "MobileSAM")
+    found = np.full((1, 4, 256, 256), np.nan, np.float32)
+    if broken == "encoder":
+        write_onnx(tmp_path / "encoder.onnx", {"x": (SQUARE, FLOAT)}, {"image_embeddings": np.nan * EMBEDDING})
+    else:
+        outputs = {"masks": found, "iou_predictions": found[..., 0, 0]}
+        write_onnx(tmp_path / "decoder.onnx", SAM_DECODER, outputs)
+    with pytest.raises(
+        InputError, match=rf"{broken}\.onnx: its output \w+ holds NaN; take the model in full precision"
+    ):
+        open_sam(str(tmp_path)).encode(photo())
