@@ -103,8 +103,10 @@ def _node(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _view(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    import signal
     import threading
 
+    from perception.interrupts import handled
     from perception.serve.listening import read_token
 
     token = None if args.token_file is None else read_token(args.token_file)
@@ -115,10 +117,12 @@ def _view(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     shown = viewer.url if token is None else f"{viewer.address}/?token=CONTENT-OF-{args.token_file.name}"
     hint = f"; over SSH: ssh -L {port}:localhost:{port} THIS-MACHINE, then open it there"
     try:
-        say(f"{args.map}: open {shown} in a browser{hint}. Ctrl-C ends.")
-        threading.Event().wait()
+        nohup = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+        with handled(signal.default_int_handler, signal.SIGTERM, *([] if nohup else [signal.SIGHUP])):
+            say(f"{args.map}: open {shown} in a browser{hint}. Ctrl-C ends.")
+            threading.Event().wait()
     except KeyboardInterrupt:
         viewer.stop()
-        if viewer.session.editor.dirty:
-            say("warning: the last corrections were not saved")
+        if (rescued := viewer.session.editor.rescue()) is not None:
+            say(f"warning: the last corrections were not saved; {rescued} is the map with them")
     return {"url": viewer.address}, ""

@@ -279,6 +279,18 @@ class Editor:
         self._saved = self._now
 
     @_step
+    def rescue(self) -> Path | None:
+        """Writes the map with its unsaved edits beside it, for a program that ends; its path, None without any."""
+        if not self.dirty:
+            return None
+        number = next(n for n in range(1, LARGEST) if not self._rescued(n).exists())
+        write_map(self._rescued(number), self.current(), fresh=True)
+        return self._rescued(number)
+
+    def _rescued(self, number: int) -> Path:
+        return self.path.with_name(f"{self.path.stem}.unsaved-{number}{self.path.suffix}")
+
+    @_step
     def set_scale(self, known_length: str) -> dict[str, Any]:
         """Writes the map in metres by `scale_map`, whose result is returned, and opens it anew without history.
 

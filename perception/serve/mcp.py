@@ -42,6 +42,7 @@ try:
     from mcp import MCPError, types
     from mcp.server import Server
     from mcp.server.stdio import stdio_server
+    from mcp.server.transport_security import TransportSecuritySettings
 except ImportError as error:
     raise missing_extra("mcp", "mcp") from error
 
@@ -329,7 +330,10 @@ def serve_http(path: Path, settings: ServeSettings, encoders: Any = None) -> Non
 
     def build(engine: QueryEngine, settings: ServeSettings) -> Any:
         server = make_server(engine, settings.photos)
-        app = server.streamable_http_app(stateless_http=True, max_request_body_size=MAX_PICTURE, host=settings.host)
+        options: dict[str, Any] = {"stateless_http": True, "max_request_body_size": MAX_PICTURE, "host": settings.host}
+        if settings.token is not None:  # behind a proxy, Host is the proxy's name; the SDK would refuse it
+            options["transport_security"] = TransportSecuritySettings(enable_dns_rebinding_protection=False)
+        app = server.streamable_http_app(**options)
         app.add_middleware(HttpGuard, settings=settings)
         return app
 

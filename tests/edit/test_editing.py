@@ -253,3 +253,14 @@ def test_a_map_opened_as_the_working_folder_is_saved_again_and_again(
         editor.rename(0, name)
         editor.save()
     assert read_map(path).instances[0]["label"] == "cup"
+
+
+def test_unsaved_edits_are_written_beside_the_map(path: Path) -> None:
+    editor, before = Editor(path), read_map(path).instances
+    assert editor.rescue() is None
+    for name in ("mug", "cup"):
+        editor.rename(0, name)
+        rescued = editor.rescue()
+        assert rescued is not None and rescued.parent == path.parent and rescued != path
+        assert read_map(rescued).instances[0]["label"] == name
+    assert read_map(path).instances == before and len(list(path.parent.glob("*.unsaved-*"))) == 2

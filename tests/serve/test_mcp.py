@@ -392,8 +392,9 @@ def test_the_rules_for_host_token_and_size_are_those_of_serve(port: int, tmp_pat
         async def session(client: Client) -> None:
             assert len((await told(client, "list_objects"))["hits"]) == 9
 
-        bearer = httpx2.AsyncClient(headers={"Authorization": f"Bearer {TOKEN}"})
-        ended(Client(streamable_http_client(at(own), http_client=bearer)), session)
+        for name in (f"127.0.0.1:{own}", "robot.example"):  # the second as behind a proxy
+            bearer = httpx2.AsyncClient(headers={"Authorization": f"Bearer {TOKEN}", "Host": name})
+            ended(Client(streamable_http_client(at(own), http_client=bearer)), session)
 
 
 # ------------------------------------------------------------------ in process

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import socket
 import time
 from collections.abc import Callable
@@ -167,11 +168,11 @@ def test_a_port_in_use_is_told(tmp_path: Path) -> None:
         Viewer(tmp_path / "none.gsmap", port=free_port())
 
 
-def test_without_a_display_the_address_is_printed_and_ctrl_c_ends(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_without_a_display_the_address_is_printed_and_ctrl_c_ends(tmp_path: Path, number: int) -> None:
     """As over SSH: no DISPLAY, no browser; the page answers, and Ctrl-C ends it without noise."""
     pytest.importorskip("viser")
     import os
-    import signal
     import subprocess
     import sys
     from urllib.request import HTTPCookieProcessor, build_opener
@@ -190,7 +191,7 @@ def test_without_a_display_the_address_is_printed_and_ctrl_c_ends(tmp_path: Path
         cookies = build_opener(HTTPCookieProcessor())
         with cookies.open(address, timeout=30) as page:
             assert page.status == 200 and b"<script" in page.read()
-        viewer.send_signal(signal.SIGINT)
+        viewer.send_signal(number)
         out, err = viewer.communicate(timeout=60)
     finally:
         viewer.kill()
