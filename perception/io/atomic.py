@@ -26,6 +26,8 @@ from uuid import uuid4
 from perception.errors import InputError
 
 _FULL = {errno.ENOSPC, errno.EDQUOT}
+_NO_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.EBADF, errno.EACCES}
+"""Of file systems that cannot sync a folder, or what is not opened for writing."""
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # from Linux fcntl.h and fs.h
 RETRY, TRIES = 0.001, 10_000  # seconds between two tries to lock what is written, and their number
 _TEMPORARY = re.compile(r"(new|old)-\d.*-.{8}")
@@ -249,7 +251,7 @@ def _sync(path: Path) -> None:
     try:
         os.fsync(descriptor)
     except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.EBADF):  # not all can sync a folder
+        if error.errno not in _NO_SYNC:
             raise
     finally:
         os.close(descriptor)

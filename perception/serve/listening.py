@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hmac
 import ipaddress
 import socket
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from perception.errors import InputError, refuse_named_pipe
 from perception.io.documents import refusing
@@ -16,6 +18,7 @@ MAKE_TOKEN = "openssl rand -hex 24 > token, then --token-file token"
 _MIN_TOKEN = 16
 _LOCAL_NAMES = {"localhost", "127.0.0.1", "[::1]"}
 _BACKLOG = 256
+_NOT_HERE = {errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT}
 
 
 def is_local(host: str) -> bool:
@@ -64,22 +67,31 @@ def url_host(host: str) -> str:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A bound, listening TCP socket; InputError naming the argument when the address or port is not available."""
+    """A bound, listening TCP socket: of a name's addresses the first that this machine has, IPv4 first. InputError
+    naming the argument when the address or port is not available."""
     with refusing(f"host {host}: is no address of this machine ({{why}})"):
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-    family, kind, protocol, _, address = found[0]
-    sock = socket.socket(family, kind, protocol)
-    try:
+    for family, _, _, _, address in sorted(found, key=lambda each: each[0] != socket.AF_INET):
+        try:
+            return _bound(family, address)
+        except OSError as error:
+            trouble = error
+            if error.errno not in _NOT_HERE:
+                break
+    if trouble.errno == errno.EADDRINUSE:
+        raise InputError(f"port {port}: is in use on {host}; stop that server or choose another port") from trouble
+    if trouble.errno in _NOT_HERE:
+        raise InputError(f"host {host}: is no address of this machine") from trouble
+    raise InputError(f"host {host}, port {port}: cannot listen there ({trouble.strerror})") from trouble
+
+
+def _bound(family: int, address: tuple[Any, ...]) -> socket.socket:
+    with contextlib.ExitStack() as undo:
+        sock = undo.enter_context(socket.socket(family, socket.SOCK_STREAM))
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a restart must not wait for old connections
         sock.bind(address)
         sock.listen(_BACKLOG)
-    except OSError as error:
-        sock.close()
-        if error.errno == errno.EADDRINUSE:
-            raise InputError(f"port {port}: is in use on {host}; stop that server or choose another port") from error
-        if error.errno == errno.EADDRNOTAVAIL:
-            raise InputError(f"host {host}: is no address of this machine") from error
-        raise InputError(f"host {host}, port {port}: cannot listen there ({error.strerror})") from error
+        undo.pop_all()
     return sock
 
 

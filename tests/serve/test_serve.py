@@ -6,6 +6,7 @@ import io
 import json
 import os
 import shutil
+import socket
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,7 +30,7 @@ from perception.map.write import read_map
 from perception.query import QueryMap
 from perception.serve.app import build_app
 from perception.serve.engine import QueryEngine
-from perception.serve.listening import check_address, is_local, read_token
+from perception.serve.listening import check_address, is_local, listen, read_token
 from perception.serve.requests import ServeSettings
 from perception.serve.server import serve
 
@@ -395,3 +396,27 @@ def test_json_of_nothing_but_numbers(client: TestClient) -> None:
     """No NaN or Infinity leaves the server, whatever is asked."""
     for url in ("/instances", "/instances/0", "/health"):
         json.loads(client.get(url).text, parse_constant=lambda name: pytest.fail(name))
+
+
+def test_a_name_of_several_addresses_is_that_which_the_machine_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    def resolve(*addresses: str) -> None:
+        families = [socket.AF_INET6 if ":" in address else socket.AF_INET for address in addresses]
+        found = [(family, 1, 6, "", (address, 0)) for family, address in zip(families, addresses, strict=True)]
+        monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+
+    for addresses in (("::1", "127.0.0.1"), ("203.0.113.1", "127.0.0.1"), ("2001:db8::1", "203.0.113.1", "127.0.0.1")):
+        resolve(*addresses)
+        with listen("localhost", 0) as sock:
+            assert sock.getsockname()[0] == "127.0.0.1"
+    resolve("203.0.113.1", "2001:db8::1")
+    with pytest.raises(InputError, match="host localhost: is no address of this machine"):
+        listen("localhost", 0)
+
+
+def test_a_port_in_use_is_told_though_another_address_of_the_name_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
+    with listen("127.0.0.1", 0) as busy:
+        port = busy.getsockname()[1]
+        found = [(socket.AF_INET, 1, 6, "", (address, port)) for address in ("127.0.0.1", "127.0.0.2")]
+        monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+        with pytest.raises(InputError, match=f"port {port}: is in use"):
+            listen("localhost", port)
