@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 ENDING = (signal.SIGINT, signal.SIGTERM)
@@ -23,6 +23,12 @@ def handled(handler: Callable[[int, Any], object], *numbers: int) -> Iterator[No
     finally:
         for number, old in before.items():
             signal.signal(number, old if old is not None else signal.SIG_DFL)
+
+
+def ends_as_ctrl_c() -> AbstractContextManager[None]:
+    """Inside the block SIGTERM, and SIGHUP where it is not ignored, as by nohup, raise KeyboardInterrupt."""
+    hang_up = () if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else (signal.SIGHUP,)
+    return handled(signal.default_int_handler, signal.SIGTERM, *hang_up)
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from perception.interrupts import ends_as_ctrl_c
 from support.processes import hears_ctrl_c
 
 pty = pytest.importorskip("pty")  # not on Windows
@@ -139,3 +140,13 @@ def test_closed_streams_are_not_written_to_files(tmp_path: Path) -> None:
     closed = ["sh", "-c", 'exec "$@" 2>&-', "sh", sys.executable, "-c", code]
     done = subprocess.run(closed, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=True)
     assert (done.stdout, (tmp_path / "file").read_bytes()) == ("2 True\n", b"")
+
+
+@pytest.mark.parametrize("nohup", [True, False])
+def test_a_closed_terminal_is_ctrl_c_but_under_nohup(nohup: bool) -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN if nohup else signal.SIG_DFL)
+    try:
+        with contextlib.nullcontext() if nohup else pytest.raises(KeyboardInterrupt), ends_as_ctrl_c():
+            signal.raise_signal(signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, before)

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import signal
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 from perception.cli.parser import Parser, command, map_command
 from perception.errors import InputError
-from perception.interrupts import handled
+from perception.interrupts import ends_as_ctrl_c
 from perception.progress import Progress
 
 
@@ -152,7 +150,7 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.tasks.engine import Engine
 
     engine = Engine(args.engine, args.address)
-    with _sigterm_as_interrupt(), Progress() as progress:
+    with ends_as_ctrl_c(), Progress() as progress:
         build_map(args.input, args.output, config, resume=args.resume, progress=progress, engine=engine)
         info = write_own_report(args.output, progress)
     return map_facts(args.output, info), ""
@@ -167,7 +165,7 @@ def _update(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
     refuse_inputs([args.output], [args.map])
     config = update_settings(args.map, args.config, args.pairs, settings_given(args))
-    with _sigterm_as_interrupt(), Progress() as progress:
+    with ends_as_ctrl_c(), Progress() as progress:
         update_map(args.map, args.input, args.output, config, resume=args.resume, progress=progress)
         info = write_own_report(args.output, progress)
     return map_facts(args.output, info), ""
@@ -177,7 +175,7 @@ def _fleet(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.pipeline.fleet import run_fleet
     from perception.tasks.engine import Engine
 
-    with _sigterm_as_interrupt(), Progress() as progress:
+    with ends_as_ctrl_c(), Progress() as progress:
         made = run_fleet(args.jobs, Engine(args.engine, args.address), progress)
     failed = [job for job in made if "error" in job]
     if failed:
@@ -185,11 +183,6 @@ def _fleet(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         found = f"{len(failed)} of {len(made)} maps could not be made"
         raise InputError(f"{args.jobs}: {found}; mend the jobs and run it again")
     return {"maps": made}, "\n".join("{output}: {instances} instances".format(**job) for job in made)
-
-
-def _sigterm_as_interrupt() -> AbstractContextManager[None]:
-    """Treats SIGTERM like Ctrl-C inside the block: finished work is kept, and the exit code is 130."""
-    return handled(signal.default_int_handler, signal.SIGTERM)
 
 
 def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
@@ -222,7 +215,7 @@ def _report(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 def _demo(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.pipeline.demo import run_demo
 
-    with _sigterm_as_interrupt(), Progress() as progress:
+    with ends_as_ctrl_c(), Progress() as progress:
         return run_demo(args.output, progress, args.seed)
 
 

@@ -103,10 +103,9 @@ def _node(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _view(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    import signal
     import threading
 
-    from perception.interrupts import handled
+    from perception.interrupts import ends_as_ctrl_c
     from perception.serve.listening import read_token
 
     token = None if args.token_file is None else read_token(args.token_file)
@@ -117,8 +116,7 @@ def _view(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     shown = viewer.url if token is None else f"{viewer.address}/?token=CONTENT-OF-{args.token_file.name}"
     hint = f"; over SSH: ssh -L {port}:localhost:{port} THIS-MACHINE, then open it there"
     try:
-        nohup = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
-        with handled(signal.default_int_handler, signal.SIGTERM, *([] if nohup else [signal.SIGHUP])):
+        with ends_as_ctrl_c():
             say(f"{args.map}: open {shown} in a browser{hint}. Ctrl-C ends.")
             threading.Event().wait()
     except KeyboardInterrupt:
