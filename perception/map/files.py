@@ -216,13 +216,13 @@ def _read_facts(path: Path) -> tuple[dict[str, Any], bytes]:
 def _read_instances(file: Path, facts: dict[str, Any]) -> tuple[list[dict[str, Any]], bytes]:
     with _damage_in(file):
         raw = file.read_bytes()
-        try:
-            value = parsed(raw.removeprefix(BOM_UTF8))  # of an editor
-            check_instances(value, facts)
-        except ValueError as error:
-            if facts.get("files", {}).get(EDITABLE, {}).get("sha256") == hashlib.sha256(raw).hexdigest():
-                raise
-            raise InputError(f"{file}: {error}; it was edited or is damaged: mend it, or copy it anew") from error
+    try:
+        value = parsed(raw.removeprefix(BOM_UTF8))  # of an editor
+        check_instances(value, facts)
+    except ValueError as error:
+        if facts.get("files", {}).get(EDITABLE, {}).get("sha256") == hashlib.sha256(raw).hexdigest():
+            raise damaged(file, str(error)) from error
+        raise InputError(f"{file}: {error}; it was edited or is damaged: mend it, or copy it anew") from error
     return value["instances"], raw
 
 

@@ -176,6 +176,7 @@ def test_instances_that_make_no_sense_are_told(copied: Path, text: str, words: s
     with pytest.raises(InputError) as error:
         perception.load_map(copied)
     one_line(error, "instances.json", words, "mend it")
+    assert "build it again" not in str(error.value)
 
 
 def test_a_byte_order_mark_of_an_editor_is_read(copied: Path) -> None:
