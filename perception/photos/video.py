@@ -121,7 +121,7 @@ def frames(
     Without `wanted`, every n-th frame: LOOKS_PER_SECOND, or about `most` in all. None where the video is unreadable."""
     if os.fsencode(video) != str(video).encode(errors="replace"):  # OpenCV would crash
         raise InputError(f"{video}: the path holds bytes that are no UTF-8; rename the video")
-    capture = cv2.VideoCapture(str(video))
+    capture = _capture(video)
     try:
         with refusing(f"{video}: {_UNREADABLE}"):
             width, height = (int(capture.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
@@ -145,9 +145,13 @@ def frames(
         capture.release()
 
 
+def _capture(video: Path) -> cv2.VideoCapture:
+    return cv2.VideoCapture(str(video.absolute()))  # FFmpeg takes "12:30.mp4" for an address of a protocol "12"
+
+
 def _counted(video: Path) -> int:
     """The number of frames, by decoding all."""
-    capture = cv2.VideoCapture(str(video))
+    capture = _capture(video)
     try:
         return sum(1 for _ in iter(capture.grab, False))
     finally:

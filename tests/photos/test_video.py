@@ -71,6 +71,14 @@ def test_videos_of_phones_and_camcorders(name: str, tmp_path: Path) -> None:
     assert photo_sizes(tmp_path / name).sizes[0] == (160, 120)
 
 
+def test_a_video_named_by_the_time_of_day(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """FFmpeg takes what stands before a colon for a protocol."""
+    write_video(tmp_path / "v.mp4", pan(3))
+    (tmp_path / "v.mp4").rename(tmp_path / "2024-05-01T12:30:01.mp4")
+    monkeypatch.chdir(tmp_path)
+    assert frame_size(Path("2024-05-01T12:30:01.mp4")) == (160, 120)
+
+
 def test_a_video_that_does_not_state_its_length(tmp_path: Path) -> None:
     """As browsers record: OpenCV tells a negative number of frames."""
     file = tmp_path / "v.avi"
