@@ -23,6 +23,8 @@ from perception.io.atomic import aside, delete, exchange, lock, make_folder, nam
 from perception.map.checksums import FACTS, is_map, own_files
 
 _NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL}
+_DELETED = ".nfs"
+"""How names of files begin that were deleted on NFS while a reader has them open; they go with the reader."""
 _held: set[tuple[Path, int]] = set()
 """Locks of this process: resolved path and thread."""
 
@@ -82,7 +84,7 @@ def _discard(old: Path, path: Path) -> None:
         _merge(old, path)  # what came meanwhile
         old.rmdir()
     except OSError as error:
-        if old.exists():
+        if old.exists() and not all(item.name.startswith(_DELETED) for item in old.iterdir()):
             warnings.warn(f"{old}: holds files from beside the map that cannot be moved to it ({error})", stacklevel=2)
 
 
@@ -101,7 +103,7 @@ def _merge(old: Path, path: Path, own: Collection[str] = ()) -> None:
                 there.chmod(mode)
     for item in old.iterdir():
         there, count = path / item.name, 0
-        if item.name in own:
+        if item.name in own or item.name.startswith(_DELETED):
             continue
         if os.path.lexists(there) and os.path.samestat(there.lstat(), item.lstat()):
             item.unlink()

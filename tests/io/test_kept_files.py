@@ -7,6 +7,7 @@ import fcntl
 import json
 import os
 import shutil
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -257,3 +258,25 @@ def test_what_is_read_only_is_kept(gmap: Path, name: str) -> None:
         else:
             write_map(gmap, read_map(gmap))
     assert before == {file.name: file.read_bytes() for file in gmap.iterdir()}
+
+
+def test_files_that_nfs_keeps_for_their_readers_stay_behind(gmap: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """NFS renames an open file that is deleted."""
+    keep_things(gmap)
+    kept, unlink = things(gmap), Path.unlink
+
+    def silly(self: Path, missing_ok: bool = False) -> None:
+        if self.suffix == ".npy" and self.exists():
+            self.rename(self.with_name(f".nfs{self.stem}"))
+        else:
+            unlink(self, missing_ok)
+
+    with monkeypatch.context() as patch, warnings.catch_warnings():
+        warnings.simplefilter("error")
+        patch.setattr(Path, "unlink", silly)
+        write_map(gmap, read_map(gmap))
+    assert things(gmap) == kept
+    left = [item for item in gmap.parent.iterdir() if item != gmap]
+    assert len(left) == 1 and all(item.name.startswith(".nfs") for item in left[0].iterdir())
+    set_labels(gmap, {0: "mug"})  # the next writer, once the reader has ended
+    assert list(gmap.parent.iterdir()) == [gmap]
