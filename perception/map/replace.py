@@ -63,7 +63,8 @@ def _link(old: Path, new: Path, own: Collection[str] = ()) -> None:
             raise InputError(f"{folder}: cannot be moved with its map (mounted, or of another user); move it elsewhere")
         (new / folder.name).mkdir()
         _link(folder, new / folder.name)
-        shutil.copystat(folder, new / folder.name)
+        with contextlib.suppress(OSError):  # a file system without rights or times
+            shutil.copystat(folder, new / folder.name)
     for file in set(old.iterdir()).difference(folders):
         if file.name not in own:
             with contextlib.suppress(OSError):  # a file system without hard links, or a file of another user
