@@ -23,6 +23,7 @@ from perception.map.write import read_map, write_map
 from perception.pipeline.checkpoint import work_folder, working
 from perception.sfm.options import ReadOptions
 from support.given_poses import NAMES, photo, write_model
+from support.viewer_maps import small_map
 from support.visited_map import write_visited_map
 
 
@@ -230,3 +231,14 @@ def test_the_photos_of_a_model_lie_beside_its_sparse(tmp_path: Path, given: str)
     whole = load_scene(tmp_path, ReadOptions(tmp_path / "work2"))
     assert [view.photo for view in scene.views] == [view.photo for view in whole.views]
     assert all(np.array_equal(a.K, b.K) for a, b in zip(scene.views, whole.views, strict=True))
+
+
+def test_without_a_folder_for_temporary_files_the_remedy_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_map(tmp_path / "a.gsmap", small_map(100))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    monkeypatch.setattr("tempfile._candidate_tempdir_list", lambda: ["/no/such"])  # as in a read-only container
+    assert main(["localise", str(tmp_path / "a.gsmap"), str(tmp_path)]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1 and "No usable temporary directory" in told and "TMPDIR" in told

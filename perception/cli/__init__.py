@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import io
 import json
 import os
@@ -37,6 +38,8 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
+_OF_THE_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.ENOENT}
+"""Errors without a path: the last where no folder for temporary files can be written."""
 _KEEPING = (["map"], ["update"], ["fleet"], ["index"], ["models"])
 """Commands that go on with what an interrupted run has made; the first two with --resume."""
 
@@ -83,10 +86,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         say(getattr(args, "interrupted", _interrupted(argv)))
         return 130
     except OSError as error:  # a path that the system refuses, wherever it is used first
-        if error.filename is None or error.strerror is None:
+        if error.filename is not None and error.strerror is not None:
+            advice = "give another path, or allow access to this one"
+            return _refused(InputError(f"{error.filename}: {error.strerror}; {advice}"))
+        if error.errno not in _OF_THE_DISK:
             raise
-        advice = "give another path, or allow access to this one"
-        return _refused(InputError(f"{error.filename}: {error.strerror}; {advice}"))
+        return _refused(InputError(f"{error.strerror}; free some space, or set TMPDIR to a folder that may be written"))
     return 0
 
 
