@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import struct
+import zlib
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -30,6 +32,8 @@ from perception.query.crops import cut_out
 from perception.query.query_map import QueryMap
 from perception.types import View
 
+_MADE, _HEADER = b"tEXtSoftware\0perception render", 33
+"""A chunk of the PNG files that are written here, after their first bytes."""
 KINDS = ("rgb", "depth", "instances", "features")
 TURNED = 15.0
 """Degrees by which no photo is turned by refined poses: its camera is in another frame."""
@@ -46,7 +50,8 @@ def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[st
     components. cameras: a transforms.json in the coordinates of the map's input, or one of `localise`; None takes the
     map's held-out views (all views if none were held out). A camera with lens distortion is rendered with that
     distortion, so that the image aligns with its photo. InputError without views, for a name that points outside
-    `output`, for an image that would replace a photo, and for a folder of photos, which a later map would be made of.
+    `output`, for an image that would replace anything but another of this command, and for a folder of photos, which a
+    later map would be made of.
     """
     what = [kind.strip() for kind in what]
     if wrong := [kind for kind in what if kind not in KINDS]:
@@ -69,6 +74,9 @@ def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[st
     if mixed := {file.parent.resolve() for file in outputs} & {photo.parent.resolve() for photo in photos}:
         found = "holds photos, and a later map would be made of pictures of this one too"
         raise InputError(f"{min(mixed)}: {found}; choose another -o")
+    for file in filter(os.path.lexists, outputs):  # the user named none of them
+        if not _is_render(file):
+            raise InputError(f"{file}: lies there, and is no picture of this command; choose another -o")
     gaussians = as_gaussians(gmap)
     for kind, folder in folders.items():
         for file, view in zip(files, views, strict=True):
@@ -165,7 +173,13 @@ def _picture(kind: str, gaussians: Gaussians, gmap: Map, view: View) -> np.ndarr
 
 
 def write_picture(path: Path, image: np.ndarray) -> None:
-    """Writes an image [H, W] or [H, W, 3] RGB; folders are made. InputError when that fails."""
+    """Writes an image [H, W] or [H, W, 3] RGB, with its maker's name; folders are made. InputError when that fails."""
     if image.ndim == 3:
         image = np.ascontiguousarray(image[..., ::-1])
-    write_file(path, cv2.imencode(".png", image)[1].tobytes())
+    png, length = cv2.imencode(".png", image)[1].tobytes(), len(_MADE) - len(b"tEXt")
+    chunk = struct.pack(">I", length) + _MADE + struct.pack(">I", zlib.crc32(_MADE))
+    write_file(path, png[:_HEADER] + chunk + png[_HEADER:])
+
+
+def _is_render(file: Path) -> bool:
+    return file.is_file() and _MADE in file.open("rb").read(_HEADER + 64)

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from perception.errors import InputError
@@ -133,3 +134,17 @@ def test_a_label_image_lies_below_its_folder(name: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="the photo name"):
         label_file(tmp_path / "masks", view)
     assert label_file(tmp_path, View("a/1.jpg", view.photo, view.K, 4, 3, np.eye(4))) == tmp_path / "a" / "1.jpg.png"
+
+
+def test_pictures_replace_pictures_of_render_alone(tmp_path: Path) -> None:
+    path, cameras = received_map(tmp_path, "a.jpg"), camera_file(tmp_path, ["a.jpg", "b.jpg"])
+    for _ in range(2):
+        render_map(path, tmp_path / "out", cameras, ["rgb"])
+    made = sorted((tmp_path / "out").iterdir())
+    before = [np.asarray(Image.open(file)) for file in made]
+    assert all(Image.open(file).text == {"Software": "perception render"} for file in made)
+    Image.fromarray(before[-1]).save(made[-1])
+    own = made[-1].read_bytes()
+    with pytest.raises(InputError, match="is no picture of this command"):
+        render_map(path, tmp_path / "out", cameras, ["rgb"])
+    assert made[-1].read_bytes() == own
