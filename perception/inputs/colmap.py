@@ -11,7 +11,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.inputs.colmap_files import Model, names_in, read_model
 from perception.io.documents import safe_name
-from perception.photos.folder import folders_below, list_photos
+from perception.photos.folder import NO_PHOTOS, folders_below, list_photos
 from perception.photos.lens import lens_from_camera
 from perception.photos.named_files import NamedFiles, parts_of
 from perception.photos.views import first_of, without_far
@@ -26,6 +26,8 @@ LOOKED_AT = 200
 SHARED = 15
 """Least number of points that a photo far from all others must share with them: half of the inliers that COLMAP asks of
 a pose."""
+APART = 0.01
+"""Mean reprojection error as a share of the long side of the photos above which it is told; models have 1 pixel."""
 _SPARSE, _DISTORTED, _PHOTOS = "sparse", "distorted", ("images", "input")
 
 
@@ -63,14 +65,17 @@ def model_photos(folder: Path) -> list[Path]:
 
 
 def photo_folder(folder: Path, model: Path, names: Sequence[str]) -> Path:
-    """The folder that holds most photos of a model: `images`, `input` (first for `distorted`) or the input itself where
-    one of them holds half, else any folder below; if none is there and the input is a `sparse` or in one, those of the
-    folder that holds it. Some of the names are tried, LOOKED_AT at most."""
+    """The folder that holds most photos of a model: `images`, `input` (first for `distorted`), those nearest to the
+    model first, or the input itself where one of them holds half, else any folder below, those of `NO_PHOTOS` last; if
+    none is there and the input is a `sparse` or in one, those of the folder that holds it. Some of the names are tried,
+    LOOKED_AT at most."""
     names = names[:: -(-len(names) // LOOKED_AT) or 1]
-    usual = [folder / name for name in _PHOTOS]
-    usual = usual[::-1] if _DISTORTED in model.relative_to(folder).parts else usual
-    best, most = usual[0], 0
-    for path in [*usual, folder, *folders_below(folder, DEPTH - 1)]:
+    inside = model.relative_to(folder).parts
+    usual = _PHOTOS[::-1] if _DISTORTED in inside else _PHOTOS
+    near = [folder.joinpath(*inside[:depth], name) for depth in range(len(inside), -1, -1) for name in usual]
+    below = sorted(folders_below(folder, DEPTH - 1), key=lambda path: bool(NO_PHOTOS.search(path.name)))
+    best, most = folder / usual[0], 0
+    for path in [*near, folder, *below]:
         files = NamedFiles(path)
         held = sum(files.find(name) is not None for name in names) if path.is_dir() else 0
         if held > most:
@@ -93,6 +98,7 @@ def read_workspace(folder: Path, options: ReadOptions) -> Scene:
         raise InputError(f"{path}: {len(wrong)} of {len(model.names)} photos cannot be used{first_of(wrong)}")
     views, facts = views_of_model(reconstruction, located, path, options, upright=False)
     facts["left_out"] = sorted([*facts["left_out"], *wrong], key=lambda entry: entry["name"])
+    facts["warnings"] += model.warnings
     if len(paths) > 1:
         sizes = {model.path: f" ({_registered(model)} photos)" for model in models}
         others = ", ".join(f"{other.relative_to(folder)}{sizes.get(other, '')}" for other in paths if other != path)
@@ -106,6 +112,9 @@ def read_workspace(folder: Path, options: ReadOptions) -> Scene:
     if len(cloud[0]) < MIN_POINTS:
         facts["warnings"].append(f"{path}: the sparse model holds {len(cloud[0])} points; new ones are triangulated")
     error = _reprojection_error(reconstruction)
+    if error is not None and error > APART * max(max(c.width, c.height) for c in reconstruction.cameras.values()):
+        apart = f"its photos see its points {error:.3g} pixels from where they are, in the mean"
+        facts["warnings"].append(f"{path}: {apart}; its poses, cameras and points do not belong together")
     facts["notes"] = [f"poses of {folder}: COLMAP model {path.relative_to(folder)}"]
     facts |= {"model": path.relative_to(folder).as_posix(), "mean_reprojection_error_px": error}
     return posed_scene(views, cloud, {"input": "colmap", **facts}, options, MIN_POINTS)

@@ -18,6 +18,8 @@ from struct import Struct
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
+
 from perception.errors import InputError
 from perception.io.documents import brief, refusing, text_of
 from perception.photos.lens import load_pycolmap
@@ -41,15 +43,18 @@ _COMMA = "has a decimal comma; export the model again with decimal points"
 
 @dataclass
 class Model:
-    """names, wrong: by image id, names as written, and why an image cannot be used. cameras, frames: what is wrong with
-    them, by id. copies: content that pycolmap is given instead of that of the files in `path`, by kind."""
+    """names, poses, wrong: by image id, names and poses as written, and why an image cannot be used. cameras, frames:
+    what is wrong with them, by id. copies: content that pycolmap is given instead of that of the files in `path`, by
+    kind. warnings: one line each."""
 
     path: Path
     names: dict[int, str] = field(default_factory=dict)
+    poses: dict[int, Sequence[float]] = field(default_factory=dict)
     wrong: dict[int, str] = field(default_factory=dict)
     cameras: dict[int, str] = field(default_factory=dict)
     frames: dict[int, str] = field(default_factory=dict)
     copies: dict[str, bytearray] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
     reconstruction: Any = None
 
     def file(self, kind: str) -> Path:
@@ -60,6 +65,8 @@ class Model:
         """Whether the parameters of a camera, or the pose of an image or a frame, are usable; notes it if not."""
         pose = kind != "cameras"
         if good := all(map(math.isfinite, values)) and (not pose or any(values[:4])):
+            if kind == "images":
+                self.poses[number] = values
             return good
         notes = {"cameras": self.cameras, "images": self.wrong, "frames": self.frames}[kind]
         what = f"the pose of {kind[:-1]}" if pose else "camera"
@@ -68,24 +75,41 @@ class Model:
 
 
 def read_model(path: Path) -> Model:
-    """The model in folder `path`. Images that are wrong have no observations. InputError for a damaged model."""
+    """The model in folder `path`. Images that are wrong have no observations; a file of points may be missing. The
+    poses of images are those of frames and rigs, where the model has these. InputError for a damaged model."""
     model = Model(path)
-    absent = [file.name for file in map(model.file, ("cameras", "images", "points3D")) if not file.is_file()]
+    absent = [file.name for file in map(model.file, ("cameras", "images")) if not file.is_file()]
     if absent:
         raise InputError(f"{path}: the sparse model lacks {', '.join(absent)}")
     used = _checked_binary(model) if model.file("images").suffix == ".bin" else _checked_text(model)
     for image_id, camera in used.items():
         if camera in model.cameras:
             model.wrong.setdefault(image_id, model.cameras[camera])
-    with refusing(f"{path}: not a readable COLMAP model ({{why}})"):
+    rigged = [file.name for file in map(model.file, ("rigs", "frames")) if file.is_file()]
+    changed = f"if another program has written images{model.file('images').suffix} since, remove {' and '.join(rigged)}"
+    with refusing(f"{path}: not a readable COLMAP model ({{why}}){f'; {changed}' if rigged else ''}"):
         model.reconstruction = _loaded(model)
+        model.reconstruction.reg_image_ids()
     for image_id, image in model.reconstruction.images.items():
         if image.frame_id in model.frames:
             model.wrong.setdefault(image_id, model.frames[image.frame_id])
         if image_id in model.wrong:
             for index in image.get_observation_point2D_idxs():
                 model.reconstruction.delete_observation(image_id, index)
+    if rigged and (other := sum(_moved(image, model.poses) for image in model.reconstruction.images.values())):
+        told = f"the poses of {other} of {len(model.names)} images differ from those by {' and '.join(rigged)}"
+        model.warnings.append(f"{model.file('images')}: {told}, which are used; {changed}")
     return model
+
+
+def _moved(image: Any, poses: dict[int, Sequence[float]]) -> bool:
+    """Whether the pose of an image in its frame is not the one that is written with the image."""
+    if image.image_id not in poses or not image.has_pose:
+        return False
+    (w, x, y, z), shift = poses[image.image_id][:4], poses[image.image_id][4:]
+    pycolmap = load_pycolmap()
+    written = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([x, y, z, w])), np.array(shift))
+    return not np.allclose(image.cam_from_world().matrix(), written.matrix(), 1e-4, 1e-6)
 
 
 def names_in(path: Path) -> list[str]:
@@ -103,9 +127,9 @@ def _loaded(model: Model) -> Any:
     if not model.copies:
         return pycolmap.Reconstruction(model.path)
     with TemporaryDirectory() as folder:
-        for file in (model.file(kind) for kind in _HEADS):
-            if file.is_file():
-                (Path(folder) / file.name).write_bytes(model.copies.get(file.stem) or file.read_bytes())
+        for kind, file in zip(_HEADS, map(model.file, _HEADS), strict=True):
+            if kind in model.copies or file.is_file():
+                (Path(folder) / file.name).write_bytes(model.copies.get(kind) or file.read_bytes())
         return pycolmap.Reconstruction(folder)
 
 
@@ -116,7 +140,7 @@ def _checked_text(model: Model) -> dict[int, int]:
     """The camera of each image of a text model; fills in what is wrong, and copies where pycolmap cannot read it."""
     cameras, images, frames, used = list[str](), list[str](), list[str](), dict[int, int]()
     for start, line in _lines(model, "cameras"):
-        number, kind, *rest = line.split() if " " in line else (line, "")
+        number, kind, *rest = line.split() if len(line.split()) > 1 else (line, "")
         if not model.judge("cameras", _id(number, start), _numbers(rest, start)):
             rest[2:] = ["1"] * len(rest[2:])
         found = f"camera {number} of model {brief(kind)} with {len(rest[2:])} parameters is not known to COLMAP"
@@ -139,11 +163,13 @@ def _checked_text(model: Model) -> dict[int, int]:
             fields[2:9] = map(str, _STILL)
         frames.append(" ".join(fields))
     raw = {kind: model.file(kind).read_bytes() for kind in _HEADS if model.file(kind).is_file()}
+    whole = "points3D" in raw and bool(images and images[-1])  # pycolmap skips a last image without a line of points
+    raw.setdefault("points3D", b"")
     if raw["points3D"].find(b",", _start(raw["points3D"])) >= 0:
         raise InputError(f"{model.file('points3D')}: {_COMMA}")
     blanks = any(re.search(r"\s", name) for name in model.names.values())
     marked = b"1.#" in raw["points3D"] or any(not data[:1].isascii() for data in raw.values())
-    if blanks or marked or model.wrong or model.cameras or model.frames:
+    if blanks or marked or not whole or model.wrong or model.cameras or model.frames:
         text = {kind: text_of(data, "replace") for kind, data in raw.items()}
         text |= {"cameras": "\n".join(cameras), "images": "\n".join(images)}
         text |= {"frames": "\n".join(frames)} if frames else {}
@@ -220,6 +246,8 @@ def _checked_binary(model: Model) -> dict[int, int]:
     for image, camera in used.items():
         if camera not in known:
             raise InputError(f"{model.file('images')}: image {image} has camera {camera}, which cameras.bin lacks")
+    if not model.file("points3D").is_file():
+        model.copies["points3D"] = bytearray(_COUNT.pack(0))
     return used
 
 
@@ -262,7 +290,7 @@ def _heads(model: Model, kind: str) -> list[tuple[int, int]]:
                 end = data.find(b"\0", at, at + _LONGEST_NAME)
                 if end < 0:
                     raise ValueError("its name has no end")
-                model.names[head[0]] = data[at:end].decode("utf-8")
+                model.names[head[0]] = data[at:end].decode("utf-8", "surrogateescape")
                 skip(end + 1 - at, 1)
                 skip(take(_COUNT)[0], 24)
             elif kind == "rigs":

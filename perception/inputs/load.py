@@ -35,7 +35,8 @@ def load_scene(source: Path, options: ReadOptions) -> Scene:
     scene.report["notes"] = [*other_inputs(source, reader), *scene.report.get("notes", [])]
     if cloud is not None:
         scene.report["points_from"] = str(cloud)
-        check_seen(scene, cloud)
+    if reader.poses and len(scene.points):
+        check_seen(scene, cloud or source)
     scene = with_checked_masks(scene, masks)
     scene.report["seconds"]["total"] = time.perf_counter() - started
     return scene

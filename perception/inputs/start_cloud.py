@@ -1,4 +1,4 @@
-"""The cloud to start training from (`--init-points`): read, and checked against the views."""
+"""The cloud to start training from: that of `--init-points` is read; any is checked against the views."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from perception.types import Scene
 GREY = 128
 FEW_SEEN = 0.01
 """Share of the points in some photo's view below which a warning is given."""
+LOOKED_AT = 100_000
+"""About as many points are looked for, of more."""
 
 
 def start_points(path: Path) -> Cloud:
@@ -27,12 +29,16 @@ def start_points(path: Path) -> Cloud:
 
 
 def check_seen(scene: Scene, path: Path) -> None:
-    """InputError when no view sees a point of the scene; adds a warning when few are seen. path: of the cloud."""
-    seen = np.zeros(len(scene.points), bool)
+    """InputError when no view sees a point of the scene; adds a warning when few are seen. path: of the cloud, or of
+    the input that brought it."""
+    points = scene.points[:: len(scene.points) // LOOKED_AT or 1]
+    seen = np.zeros(len(points), bool)
     for view in scene.views:
-        x, y, z = view.K @ (view.camera_from_world[:3, :3] @ scene.points.T + view.camera_from_world[:3, 3:])
+        x, y, z = view.K @ (view.camera_from_world[:3, :3] @ points.T + view.camera_from_world[:3, 3:])
         seen |= (z > 0) & (x >= 0) & (x < view.width * z) & (y >= 0) & (y < view.height * z)
     if not seen.any():
-        raise InputError(f"{path}: no photo sees any of its {len(seen)} points; expected frame and unit of the poses")
+        axes = "COLMAP's are camera_from_world, those of a transforms.json world_from_camera with y up and z back"
+        found = f"{path}: no photo sees any of its {len(scene.points)} points"
+        raise InputError(f"{found}; expected points and poses in one frame and unit ({axes})")
     if seen.mean() < FEW_SEEN:
         scene.report["warnings"].append(f"{path}: only {seen.mean():.2%} of its points lie in the view of some photo")

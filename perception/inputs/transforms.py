@@ -229,13 +229,12 @@ def _views(
             posed = posed_view(name, photo, lens, pose, frame.file)
         if posed is None:
             continue
-        view, note = posed
+        view, lines = posed
         mask = mask_of(options.masks, name)
         if mask is None and values.get("mask_path"):
             mask = listing.needed(frame.file, "mask", values["mask_path"])
         views[name] = replace(view, depth=_depth(frame.file, values, listing), mask=mask, held_out=frame.held_out)
-        if note:
-            notes.add(note)
+        notes.update(lines)
     return [views[name] for name in sorted(views)], missing, sorted(notes)
 
 

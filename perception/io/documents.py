@@ -96,5 +96,6 @@ def what_is_wrong(name: object) -> str | None:
     if ".." in parts:
         return 'leaves its folder by ".."'
     if found := _CONTROL.search(name):
-        return f"holds the character U+{ord(found.group()):04X}"
+        code = ord(found.group())
+        return "is not in UTF-8" if 0xD800 <= code < 0xE000 else f"holds the character U+{code:04X}"
     return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass, field, replace
 from heapq import heappop, heappush
 from pathlib import Path
@@ -31,6 +32,8 @@ PANORAMA_ASPECT, PANORAMA_EXCESS = 2.2, 1.5
 """Least aspect ratio (long / short side) of a panorama: absolute, and as a multiple of the folder's median."""
 BLURRED = 0.1
 """Share of the median sharpness (variance of the thumbnail's Laplacian) below which a photo is reported as blurred."""
+NO_PHOTOS = re.compile("mask|depth|normal|label|confidence|segment", re.IGNORECASE)
+"""In names of folders whose pictures are of photos elsewhere."""
 _SHOWN = 5
 
 

@@ -20,6 +20,8 @@ LEAST_FOCAL = 0.02
 """Least focal length as a share of the photo's long side, a view of 175°: shorter ones are not in pixels."""
 _ASPECT = 0.02
 """Largest relative difference between aspect ratios that count as the same: sizes are whole pixels."""
+_OFF_CENTRE = 0.25
+"""Share of the photo's side from its middle beyond which a principal point is told."""
 _PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 PERSPECTIVE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 FISHEYE = ("k1", "k2", "k3", "k4")
@@ -86,8 +88,10 @@ def rescale_lens(lens: Lens, width: int, height: int) -> Lens:
 def pinhole_from_lens(lens: Lens) -> tuple[tuple[float, float, float, float], int, int]:
     """(fx, fy, cx, cy), width, height of the pinhole image that `lens` undistorts to.
     As COLMAP's default: focal lengths are kept, the size is chosen so that no pixel is blank (0.2 to 2 times that of
-    the photo). Values of a lens without distortion are returned unchanged. InputError where undistortion fails."""
+    the photo). Values of a lens without distortion are returned unchanged. InputError where undistortion fails, and for
+    a principal point in the first pixel of the photo: it is not in pixels."""
     ideal, plain, pycolmap = camera_from_lens(lens), is_pinhole(lens), load_pycolmap()
+    x, y = float(ideal.principal_point_x), float(ideal.principal_point_y)
     with refusing(f"camera model {lens.model} cannot be undistorted to a pinhole"):
         ideal = ideal if plain else pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), ideal)
     fx, fy = float(ideal.focal_length_x), float(ideal.focal_length_y)
@@ -99,6 +103,9 @@ def pinhole_from_lens(lens: Lens) -> tuple[tuple[float, float, float, float], in
             f"camera {lens.model} {list(lens.params)}: seen as a pinhole of focal lengths {fx:g}, {fy:g} "
             f"and centre {cx:g}, {cy:g}; expected {least:g} to {MOST_PIXELS:g} and at most {MOST_PIXELS:g} pixels"
         )
+    if min(x, y) >= 0 and max(x, y) < min(1, lens.width / 8, lens.height / 8):
+        found = f"camera {lens.model} {list(lens.params)}: its principal point is ({x:g}, {y:g})"
+        raise InputError(f"{found}, expected pixels, about ({lens.width / 2:g}, {lens.height / 2:g})")
     width, height = int(ideal.width), int(ideal.height)
     if min(width, height) < (1 if plain else 2) or max(width, height) > MOST_SIDE:
         raise InputError(f"camera {lens.model}: {width}×{height} pixels, expected sides of 1 to {MOST_SIDE}")
@@ -127,6 +134,30 @@ def is_pinhole(lens: Lens) -> bool:
         return False
     camera = camera_from_lens(lens)
     return not any(camera.params[index] for index in camera.extra_params_idxs())
+
+
+@lru_cache(maxsize=256)
+def lens_warnings(lens: Lens) -> list[str]:
+    """A line on a principal point far from the middle, as of a camera for another size of photo, and one on distortion
+    that folds: from the centre out, undistorted photos show what they have shown before."""
+    camera, told = camera_from_lens(lens), f"camera {lens_text(lens)}"
+    centre, warnings = np.array([camera.principal_point_x, camera.principal_point_y]), list[str]()
+    if (np.abs(centre / (lens.width, lens.height) - 0.5) > _OFF_CENTRE).any():
+        where = f"its principal point ({centre[0]:.6g}, {centre[1]:.6g}) lies far from the middle of the photo"
+        warnings.append(f"{told}: {where}; unless the photos are cut so, give it in pixels of photos of this size")
+    if is_pinhole(lens):
+        return warnings
+    (fx, fy, cx, cy), width, height = pinhole_from_lens(lens)
+    border = np.array([(x, y) for x in (0, 0.5, 1) for y in (0, 0.5, 1) if (x, y) != (0.5, 0.5)]) * (width, height)
+    out = (border - (cx, cy))[:, None] / (fx, fy) * np.linspace(0, 1, 65)[:, None]  # x/z, y/z [8, 65, 2]
+    rays = np.concatenate([out, np.ones((*out.shape[:2], 1))], axis=2).reshape(-1, 3)
+    pixels = np.asarray(camera.img_from_cam(rays), np.float64).reshape(out.shape)
+    steps = np.diff(np.linalg.norm(pixels - pixels[:, :1], axis=2), axis=1)
+    inside = np.all((pixels > 0) & (pixels < (lens.width, lens.height)), axis=2)
+    if (inside[:, 1:] & (steps <= 0)).any():
+        folded = "its distortion folds the picture, so that undistorted photos show things twice towards the border"
+        warnings.append(f"{told}: {folded}; calibrate it again, or give undistorted photos")
+    return warnings
 
 
 @lru_cache(maxsize=4)

@@ -12,7 +12,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.geometry import camera_centres, far_from_most, nearest_rotation, transform
 from perception.photos.decode import orientation, photo_size
-from perception.photos.lens import is_pinhole, pinhole_from_lens, rescale_lens, resized
+from perception.photos.lens import is_pinhole, lens_warnings, pinhole_from_lens, rescale_lens, resized
 from perception.types import Lens, View
 
 FARTHEST = 1e12
@@ -47,8 +47,9 @@ def rigid_pose(matrix: np.ndarray, what: str) -> np.ndarray:
 
 def posed_view(
     name: str, photo: Path, lens: Lens, pose: np.ndarray, source: Path, upright: bool = False
-) -> tuple[View, str | None]:
-    """`make_view` of a photo with the lens that its camera says, scaled to the photo's size, and a note if it was.
+) -> tuple[View, list[str]]:
+    """`make_view` of a photo with the lens that its camera says, scaled to the photo's size, and a line if it was, and
+    on what is odd in the lens.
 
     Poses of other tools belong to the pixels as they are stored: EXIF rotation is not applied, unless the camera fits
     only the upright photo. upright: the poses are of the upright photo. InputError if sizes differ in their shape.
@@ -58,7 +59,8 @@ def posed_view(
             turned = as_stored and orientation(photo) != 1
             view = replace(make_view(name, photo, fitted, pose, source), as_stored=turned)
             size, full = f"{fitted.width}×{fitted.height}", f"{lens.width}×{lens.height}"
-            return view, None if size == full else f"{photo.name}: photo {size}, camera {full}: intrinsics scaled"
+            scaled = [] if size == full else [f"photos of {size}, camera {full}: intrinsics scaled"]
+            return view, scaled + lens_warnings(fitted)
     found = f"{photo.name} is {'×'.join(map(str, photo_size(photo)))} but its camera says {lens.width}×{lens.height}"
     raise InputError(f"{source}: {found}; give the camera of these photos or the photos of this camera")
 

@@ -34,15 +34,14 @@ def views_of_model(
         try:
             why_left_out(photo, strict=True)
             pose = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
-            view, note = posed_view(name, photo, lenses[image.camera_id], pose, source, upright)
+            view, lines = posed_view(name, photo, lenses[image.camera_id], pose, source, upright)
         except InputError as error:
             if options.strict:
                 raise
             missing.append({"name": name, "why": str(error)})
             continue
         views.append(replace(view, mask=mask_of(options.masks, name)))
-        if note:
-            notes.add(note)
+        notes.update(lines)
     if not views:
         raise InputError(
             f"{source}: none of the {len(located)} photos of the sparse model can be used{first_of(missing)}"
