@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from perception.errors import InputError
-from perception.inputs.readers import PhotoSizes, other_inputs, reader_of
+from perception.inputs.readers import JSON, PhotoSizes, other_inputs, reader_of
 from perception.inputs.start_cloud import check_seen, start_points
 from perception.photos.camera_file import read_camera
 from perception.photos.ignore_masks import with_checked_masks
@@ -32,7 +32,10 @@ def load_scene(source: Path, options: ReadOptions) -> Scene:
     options = replace(options, lens=lens, cloud=start or options.cloud)
     options.workdir.mkdir(parents=True, exist_ok=True)
     scene = reader.read(source, options)
-    scene.report["notes"] = [*other_inputs(source, reader), *scene.report.get("notes", [])]
+    notes = other_inputs(source, reader)
+    if masks is None and reader.name != JSON and (source / "masks").is_dir():
+        notes.append(f"{source / 'masks'} is not read; to ignore what is black there, give --ignore-masks")
+    scene.report["notes"] = [*notes, *scene.report.get("notes", [])]
     if cloud is not None:
         scene.report["points_from"] = str(cloud)
     if reader.poses and len(scene.points):

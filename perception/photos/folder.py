@@ -30,10 +30,15 @@ COPY_BLUR = 2.0
 copies of photos of leaves then differ by 1 grey level."""
 PANORAMA_ASPECT, PANORAMA_EXCESS = 2.2, 1.5
 """Least aspect ratio (long / short side) of a panorama: absolute, and as a multiple of the folder's median."""
+SEAM, LEAST_SEAM = 2.0, 8.0
+"""The left and the right column of a photo of all directions, 2:1, differ at most by SEAM times as much as neighbours
+do; their least standard deviation, in grey levels, for which this says something."""
 BLURRED = 0.1
 """Share of the median sharpness (variance of the thumbnail's Laplacian) below which a photo is reported as blurred."""
 NO_PHOTOS = re.compile("mask|depth|normal|label|confidence|segment", re.IGNORECASE)
 """In names of folders whose pictures are of photos elsewhere."""
+_HIDDEN = (".", "@eaDir", "#recycle", "#snapshot", "$RECYCLE.BIN", "__MACOSX")
+"""How names of files and folders begin that belong to the system."""
 _SHOWN = 5
 
 
@@ -63,8 +68,8 @@ class _Look:
 
 def list_photos(folder: Path, suffixes: frozenset[str] = SUFFIXES) -> list[Path]:
     """All photos, or files of other suffixes, under `folder`, sorted by their path relative to it.
-    Skipped: hidden files and folders, maps and work folders (*.gsmap*), frames taken from a video. Linked folders are
-    followed; each real folder is listed once."""
+    Skipped: hidden files and folders, maps and work folders (*.gsmap*), frames taken from a video, and folders in which
+    systems keep thumbnails and what was deleted. Linked folders are followed; each real folder is listed once."""
     folder = Path(folder)
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "no such folder"
@@ -80,7 +85,7 @@ def list_photos(folder: Path, suffixes: frozenset[str] = SUFFIXES) -> list[Path]
             inside = list(here.iterdir())
         except OSError:  # a folder without read permission
             continue
-        for path in (path for path in inside if not path.name.startswith(".")):
+        for path in (path for path in inside if not path.name.startswith(_HIDDEN)):
             if path.is_dir():
                 if ".gsmap" not in path.name and not (path / FRAMES_RECORD).is_file():
                     heappush(links if path.is_symlink() else waiting, path)
@@ -118,10 +123,10 @@ def view_name(photo: Path, folder: Path) -> str:
 def choose_photos(folder: Path, strict: bool, progress: Progress) -> PhotoSet:
     """The photos under `folder` to use for structure from motion; each photo is read once, in several threads.
 
-    Left out with the reason: damaged photos, panoramas (not pinhole images) and duplicates. Of neighbours by name with
-    nearly the same picture (bursts, JPEG and HEIC of one photo) the sharpest is kept, of equal pictures the first, of
-    copies at other sizes the largest.
-    Blurred photos are kept and reported. strict: the first photo that cannot be read is raised as InputError.
+    Left out with the reason: damaged photos, masks and the like, panoramas (not pinhole images) and duplicates. Of
+    neighbours by name with nearly the same picture (bursts, JPEG and HEIC of one photo) the sharpest is kept, of equal
+    pictures the first, of copies at other sizes the largest. Blurred photos are kept and reported. strict: the first
+    photo that cannot be read is raised as InputError.
     """
     paths = list_photos(folder)
     named: dict[str, _Look] = {}
@@ -131,6 +136,7 @@ def choose_photos(folder: Path, strict: bool, progress: Progress) -> PhotoSet:
         named[look.name] = look
         progress.update("poses: photos", done, len(paths))
     looks = list(named.values())
+    _leave_out_pictures_of_photos([look for look in looks if look.why is None])
     _leave_out_panoramas([look for look in looks if look.why is None])
     _leave_out_doubles([look for look in looks if look.why is None])
     kept = [look for look in looks if look.why is None]
@@ -165,12 +171,32 @@ def _thumbnail_size(size: tuple[int, int]) -> tuple[int, int]:
     return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
 
 
+def _leave_out_pictures_of_photos(looks: list[_Look]) -> None:
+    """Marks what lies in folders of NO_PHOTOS where a photo of that name lies elsewhere: "masks/1.jpg.png"."""
+    of_photos = [look for look in looks if NO_PHOTOS.search(Path(look.name).parent.as_posix())]
+    marked = {look.name for look in of_photos}
+    stems = {Path(look.name).stem.casefold() for look in looks if look.name not in marked}
+    for look in of_photos:
+        stem = Path(look.name).stem.casefold()
+        if stems & {stem, Path(stem).stem}:
+            look.why = "by its folder a mask, depth or the like of a photo, and none itself"
+
+
 def _leave_out_panoramas(looks: list[_Look]) -> None:
     aspects = [max(look.size) / min(look.size) for look in looks]
     least = max(PANORAMA_ASPECT, PANORAMA_EXCESS * float(np.median(aspects))) if aspects else 0.0
+    around = [look for look, aspect in zip(looks, aspects, strict=True) if round(100 * aspect) == 200]
+    closed = {id(look) for look in around if _is_closed(look.grey)}
     for look, aspect in zip(looks, aspects, strict=True):
-        if look.stitched or aspect >= least:
+        if look.stitched or aspect >= least or (id(look) in closed and 2 * len(closed) > len(around)):
             look.why = f"a panorama ({look.size[0]}×{look.size[1]}): stitched photos fit no camera; use ordinary photos"
+
+
+def _is_closed(grey: np.ndarray) -> bool:
+    """Whether a picture goes on at its left where it ends at its right, as one of all directions."""
+    columns = grey.T.astype(np.float64)
+    steps = np.abs(np.diff(columns, axis=0)).mean(axis=1)
+    return bool(columns[0].std() > LEAST_SEAM and np.abs(columns[0] - columns[-1]).mean() < SEAM * np.median(steps))
 
 
 def _leave_out_doubles(looks: list[_Look]) -> None:
@@ -227,6 +253,9 @@ def _notes(folder: Path, looks: list[_Look], kept: list[_Look]) -> list[str]:
     notes, of = [], f"of {len(looks)} photos"
     if doubles := [look.name for look in looks if (look.why or "").startswith("a double")]:
         notes.append(f"{len(doubles)} {of} are doubles (bursts, copies) and left out: {_some(doubles)}")
+    if others := [look.name for look in looks if (look.why or "").startswith("by its folder")]:
+        told = "are by their folders masks, depth or the like and left out (--ignore-masks takes masks)"
+        notes.append(f"{len(others)} {of} {told}: {_some(others)}")
     if broken := [look for look in looks if look.unreadable]:
         names = _some([look.name for look in broken])
         notes.append(f"warning: {len(broken)} {of} cannot be read and are left out: {names} ({broken[0].why})")

@@ -152,6 +152,49 @@ def test_wide_cameras_are_no_panoramas(tmp_path: Path) -> None:
     assert len(choose_photos(tmp_path, True, Told()).photos) == 4
 
 
+@pytest.mark.parametrize("folder", ["masks", "depth_8bit", "a/Masks"])
+def test_masks_beside_the_photos_are_no_photos(folder: str, tmp_path: Path) -> None:
+    for index, name in enumerate(("1", "2.jpg", "other")):
+        save(tmp_path / "images" / f"{Path(name).stem}.jpg", index)
+        save(tmp_path / folder / f"{name}.png", 10 + index)
+    save(tmp_path / folder / "alone.png", 20)
+    chosen = choose_photos(tmp_path, True, Told())
+    assert sorted(chosen.names) == sorted([f"{folder}/alone.png", *(f"images/{n}.jpg" for n in ("1", "2", "other"))])
+    assert any("3 of 7 photos are by their folders masks" in note for note in chosen.notes)
+
+
+def test_folders_of_the_system_hold_no_photos(tmp_path: Path) -> None:
+    """Synology keeps a thumbnail of each photo in a folder of the photo's name, and what was deleted in #recycle."""
+    for name in ("a.jpg", "@eaDir/a.jpg/SYNOPHOTO_THUMB_XL.jpg", "#recycle/b.jpg", "$RECYCLE.BIN/c.jpg", "#1.jpg"):
+        save(tmp_path / name, 0)
+    assert relative(tmp_path) == ["#1.jpg", "a.jpg"]
+
+
+def all_around(turn: float, size: tuple[int, int] = (640, 320)) -> np.ndarray:
+    """What a camera of all directions sees of waves of light from far away, equirectangular, [h, w, 3] uint8."""
+    longitude, latitude = np.meshgrid(
+        2 * np.pi * (np.arange(size[0]) + 0.5) / size[0] + turn, np.pi * ((np.arange(size[1]) + 0.5) / size[1] - 0.5)
+    )
+    rays = np.stack([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)], 2)
+    waves = np.random.default_rng(0).normal(0, 6, (12, 3))
+    light = np.sin(rays @ waves.T).sum(axis=2)
+    return np.repeat((128 + 25 * light).clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def test_photos_of_all_directions_are_panoramas_where_nothing_says_so(tmp_path: Path) -> None:
+    """Frames of a 360° camera have no GPano; photos of 2:1 that end anywhere stay."""
+    for index in range(6):
+        picture = Image.fromarray(all_around(index))
+        picture.save(tmp_path / f"{index}.png")
+        picture.crop((0, 0, 480, 240)).save(tmp_path / f"cut{index}.png")
+    assert [left["name"] for left in choose_photos(tmp_path, True, Told()).left_out] == []  # half of them: no
+    for index in range(6):
+        (tmp_path / f"cut{index}.png").unlink()
+    left = choose_photos(tmp_path, True, Told()).left_out
+    assert [entry["name"] for entry in left] == [f"{index}.png" for index in range(6)]
+    assert all("a panorama (640×320)" in entry["why"] for entry in left)
+
+
 def test_videos_beside_photos_are_told(tmp_path: Path) -> None:
     for index in range(3):
         save(tmp_path / f"IMG_{index}.jpg", index)
