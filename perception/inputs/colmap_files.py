@@ -81,14 +81,20 @@ def read_model(path: Path) -> Model:
     absent = [file.name for file in map(model.file, ("cameras", "images")) if not file.is_file()]
     if absent:
         raise InputError(f"{path}: the sparse model lacks {', '.join(absent)}")
-    used = _checked_binary(model) if model.file("images").suffix == ".bin" else _checked_text(model)
+    checked = _checked_binary if model.file("images").suffix == ".bin" else _checked_text
+    used = checked(model)
     for image_id, camera in used.items():
         if camera in model.cameras:
             model.wrong.setdefault(image_id, model.cameras[camera])
     rigged = [file.name for file in map(model.file, ("rigs", "frames")) if file.is_file()]
     changed = f"if another program has written images{model.file('images').suffix} since, remove {' and '.join(rigged)}"
     with refusing(f"{path}: not a readable COLMAP model ({{why}}){f'; {changed}' if rigged else ''}"):
-        model.reconstruction = _loaded(model)
+        try:
+            model.reconstruction = _loaded(model)
+        except Exception:  # pycolmap's errors have no common class
+            checked(model, bare=True)
+            model.reconstruction = _loaded(model)
+            model.warnings.append(f"{path}: the tracks of its points do not fit its images, and are not used")
         model.reconstruction.reg_image_ids()
     for image_id, image in model.reconstruction.images.items():
         if image.frame_id in model.frames:
@@ -136,8 +142,9 @@ def _loaded(model: Model) -> Any:
 # ---------------------------------------------------------------------- text
 
 
-def _checked_text(model: Model) -> dict[int, int]:
-    """The camera of each image of a text model; fills in what is wrong, and copies where pycolmap cannot read it."""
+def _checked_text(model: Model, bare: bool = False) -> dict[int, int]:
+    """The camera of each image of a text model; fills in what is wrong, and copies where pycolmap cannot read it.
+    bare: copies without observations."""
     cameras, images, frames, used = list[str](), list[str](), list[str](), dict[int, int]()
     for start, line in _lines(model, "cameras"):
         number, kind, *rest = line.split() if len(line.split()) > 1 else (line, "")
@@ -156,14 +163,15 @@ def _checked_text(model: Model) -> dict[int, int]:
         if fields[8] not in known:
             raise InputError(f"{start}: image {image_id} has camera {fields[8]}, which cameras.txt lacks")
         used[image_id] = _id(fields[8], start)
-        images += [" ".join([*fields[:9], fields[0]]), points]
+        images += [" ".join([*fields[:9], fields[0]]), "" if bare else points]
     for start, line in _lines(model, "frames"):
         fields = line.split()
         if not model.judge("frames", _id(fields[0], start), _numbers(fields[2:9], start)):
             fields[2:9] = map(str, _STILL)
         frames.append(" ".join(fields))
     raw = {kind: model.file(kind).read_bytes() for kind in _HEADS if model.file(kind).is_file()}
-    whole = "points3D" in raw and bool(images and images[-1])  # pycolmap skips a last image without a line of points
+    # Of a last image without a line of points pycolmap takes the frame alone.
+    whole = "points3D" in raw and bool(images and images[-1])
     raw.setdefault("points3D", b"")
     if raw["points3D"].find(b",", _start(raw["points3D"])) >= 0:
         raise InputError(f"{model.file('points3D')}: {_COMMA}")
@@ -174,6 +182,9 @@ def _checked_text(model: Model) -> dict[int, int]:
         text |= {"cameras": "\n".join(cameras), "images": "\n".join(images)}
         text |= {"frames": "\n".join(frames)} if frames else {}
         text["points3D"] = re.sub(r"-?1\.#\w+", "nan", text["points3D"])
+        if bare:
+            rows = (line.split() for line in text["points3D"].splitlines() if not line.startswith("#"))
+            text["points3D"] = "\n".join(" ".join([*row[:7], "0"]) for row in rows if row)
         model.copies = {kind: bytearray(f"{content}\n", "utf-8") for kind, content in text.items()}
     return used
 
@@ -238,10 +249,10 @@ def _numbers(fields: Sequence[str], start: str) -> list[float]:
 # -------------------------------------------------------------------- binary
 
 
-def _checked_binary(model: Model) -> dict[int, int]:
+def _checked_binary(model: Model, bare: bool = False) -> dict[int, int]:
     """The camera of each image of a binary model; fills in what is wrong, and copies where pycolmap cannot read it.
-    InputError naming the first file and record that is not valid."""
-    heads = {kind: _heads(model, kind) for kind in _HEADS}
+    bare: copies without observations. InputError naming the first file and record that is not valid."""
+    heads = {kind: _heads(model, kind, bare) for kind in _HEADS}
     known, used = {camera for camera, _ in heads["cameras"]}, dict(heads["images"])
     for image, camera in used.items():
         if camera not in known:
@@ -251,12 +262,12 @@ def _checked_binary(model: Model) -> dict[int, int]:
     return used
 
 
-def _heads(model: Model, kind: str) -> list[tuple[int, int]]:
+def _heads(model: Model, kind: str, bare: bool = False) -> list[tuple[int, int]]:
     """First and last number of each record's head; [] if the file does not exist. InputError for an id that repeats."""
     file = model.file(kind)
     if not file.is_file():
         return []
-    data, at, found = file.read_bytes(), 0, list[tuple[int, int]]()
+    data, at, found, parts = file.read_bytes(), 0, list[tuple[int, int]](), list[slice]()
 
     def take(layout: Struct) -> tuple:
         skip(1, layout.size)
@@ -292,6 +303,7 @@ def _heads(model: Model, kind: str) -> list[tuple[int, int]]:
                     raise ValueError("its name has no end")
                 model.names[head[0]] = data[at:end].decode("utf-8", "surrogateescape")
                 skip(end + 1 - at, 1)
+                parts.append(slice(start, at))
                 skip(take(_COUNT)[0], 24)
             elif kind == "rigs":
                 for number in range(head[1]):
@@ -299,10 +311,14 @@ def _heads(model: Model, kind: str) -> list[tuple[int, int]]:
                     if number and take(_FLAG)[0]:
                         take(_POSE)
             else:
+                parts.append(slice(start, at - _COUNT.size))
                 skip(head[-1], 8 if kind == "points3D" else 16)
             found.append((head[0], head[-1]))
         if len({head[0] for head in found}) != len(found):
             raise ValueError("an id occurs twice")
+        if bare and kind in ("images", "points3D"):
+            whole = bytes(model.copies.get(kind, data))
+            model.copies[kind] = bytearray(whole[: _COUNT.size] + b"".join(whole[p] + _COUNT.pack(0) for p in parts))
     except ValueError as error:
         what = f"what follows {len(found)} good records cannot be right ({error})"
         raise InputError(f"{file}: {what}; the model is damaged") from error

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -175,23 +176,52 @@ def test_poses_that_look_away_from_the_points_are_refused(kind: str, tmp_path: P
         loaded(tmp_path / "in")
 
 
-def test_observations_far_from_their_points_are_told(tmp_path: Path) -> None:
-    """First each photo sees each point where it is; then all points move by half a unit."""
-    folder = workspace(tmp_path / "in")
-    pycolmap = load_pycolmap()
-    model = pycolmap.Reconstruction(folder / "sparse/0")
-    for image in model.images.values():
+def tracked(folder: Path, write: str = "write_text") -> Any:
+    """A workspace in which each photo sees each point where it is."""
+    pycolmap, path = load_pycolmap(), workspace(folder) / "sparse/0"
+    model = pycolmap.Reconstruction(path)
+    for image_id, image in model.images.items():
         seen = [image.project_point(model.points3D[number].xyz) for number in sorted(model.points3D)]
         image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in seen])
-    for image_id in model.images:
         for index, number in enumerate(sorted(model.points3D)):
             model.add_observation(number, pycolmap.TrackElement(image_id, index))
-    model.write_text(folder / "sparse/0")
-    scene = loaded(folder)
-    assert scene.report["warnings"] == [] and scene.report["mean_reprojection_error_px"] < 1e-6
+    for file in path.iterdir():
+        file.unlink()
+    getattr(model, write)(path)
+    for file in [*path.glob("rigs.*"), *path.glob("frames.*")]:
+        file.unlink()
+    return model
+
+
+def test_observations_far_from_their_points_are_told(tmp_path: Path) -> None:
+    """First each photo sees each point where it is; then all points move by half a unit."""
+    model = tracked(tmp_path / "in")
+    report = loaded(tmp_path / "in").report
+    assert report["warnings"] == [] and report["mean_reprojection_error_px"] < 1e-6
     for point in model.points3D.values():
         point.xyz = np.add(point.xyz, (0.5, 0, 0))
-    model.write_text(folder / "sparse/0")
-    error = loaded(folder).report
-    assert error["mean_reprojection_error_px"] > 2
-    assert any("poses, cameras and points do not belong together" in line for line in error["warnings"])
+    model.write_text(tmp_path / "in/sparse/0")
+    report = loaded(tmp_path / "in").report
+    assert report["mean_reprojection_error_px"] > 2
+    assert any("poses, cameras and points do not belong together" in line for line in report["warnings"])
+
+
+@pytest.mark.parametrize("what", ["photos removed", "observations removed"])
+@pytest.mark.parametrize("write", ["write_text", "write_binary"])
+def test_tracks_that_lead_nowhere_are_not_used(write: str, what: str, tmp_path: Path) -> None:
+    """Who takes photos out of images.txt, or empties its lines of points, leaves the tracks; nothing else is lost."""
+    count, model = 6 if what == "photos removed" else 8, tracked(tmp_path / "in", write)
+    if write == "write_text":
+        file = tmp_path / "in/sparse/0/images.txt"
+        rows = [row for row in file.read_text().splitlines() if not row.startswith("#")][: 2 * count]
+        rows[1::2] = rows[1::2] if count == 6 else [""] * 8
+        file.write_text("\n".join(rows) + "\n")
+    else:
+        file = tmp_path / "in/sparse/0/images.bin"
+        images = records(file.read_bytes())[:count]
+        images = images if count == 6 else [image[: image.index(b"\0", 64) + 1] + bytes(8) for image in images]
+        file.write_bytes(struct.pack("<Q", count) + b"".join(images))
+    scene = loaded(tmp_path / "in")
+    check_poses(scene, list(range(count)))
+    np.testing.assert_allclose(scene.points, [model.points3D[number].xyz for number in sorted(model.points3D)])
+    assert any("tracks of its points do not fit its images, and are not used" in w for w in scene.report["warnings"])
