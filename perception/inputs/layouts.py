@@ -79,9 +79,10 @@ def refuse_depth_without_poses(source: Path) -> None:
     first = next((name for name in names if "depth" in name.lower() and _has_16_bits(source / name)), None)
     if first is not None:
         raise InputError(
-            f"{source}: has depth images ({first}) but no poses; expected transforms.json with depth_file_path, "
-            "groundtruth.txt (TUM), pose/*.txt (ScanNet) or a trajectory *.log (Redwood); to map the photos alone, "
-            "give a folder without depth"
+            f"{source}: has depth images ({first}) but no poses that are read; expected transforms.json with "
+            "depth_file_path (which nerfstudio's ns-process-data writes for Polycam and Record3D), groundtruth.txt "
+            "(TUM), pose/*.txt (ScanNet) or a trajectory *.log (Redwood); to map the photos alone, give a folder "
+            "without depth"
         )
 
 

@@ -22,7 +22,7 @@ from perception.inputs.transforms import (
 )
 from perception.photos import video
 from perception.photos.decode import orientation, photo_size
-from perception.photos.folder import VIDEO_SUFFIXES, list_photos
+from perception.photos.folder import VIDEO_SUFFIXES, folders_below, list_photos
 from perception.photos.views import fit_lens
 from perception.sfm.options import ReadOptions
 from perception.sfm.reconstruct import reconstruct
@@ -173,11 +173,14 @@ EXPECTED = (
 )
 _BAGS = (".bag", ".mcap", ".db3")
 UNREAD = (
-    *("*.nvm", "bundle*.out", "cameras.xml", "cameras.sfm", "sfm_data.json", "poses_bounds.npy", "reconstruction.json"),
-    *("cameras.json", "model.tsv", "*.rsproj", "*.psx"),
+    *("*.nvm", "bundle*.out", "camera*.xml", "cameras.sfm", "sfm_data.json", "poses_bounds.npy", "reconstruction.json"),
+    *("cameras.json", "model.tsv", "*.rsproj", "*.psx", "*.xmp", "cameras/*.json", "metadata.json", "odometry.csv"),
+    *("frame_*.json", "traj*.txt", "*.traj"),
 )
 """Files of other programs that hold poses of photos and are not read: Bundler, Metashape, Meshroom, OpenMVG, LLFF,
-OpenSfM, Gaussian splatting, RealityScan."""
+OpenSfM, Gaussian splatting, RealityScan, Polycam, Record3D, Stray Scanner, 3D Scanner App, Replica, kapture, ARKit."""
+UNREAD_DEPTH = 2
+"""Folders below the input in which they are looked for."""
 
 
 def reader_of(source: Path) -> Reader:
@@ -202,7 +205,10 @@ def other_inputs(source: Path, reader: Reader) -> list[str]:
     others = [path.relative_to(source).as_posix() for path in json_files(source) if path not in used]
     if reader.name in (COLMAP, JSON) and layout_of(source) is not None:
         others.append(f"an {RECORDING}")
-    others += [path.name for pattern in UNREAD for path in sorted(source.glob(pattern))]
+    below = folders_below(source, UNREAD_DEPTH)
+    for found in ([path for folder in below for path in sorted(folder.glob(pattern))] for pattern in UNREAD):
+        more = f" and {len(found) - 1} more" if found[1:] else ""
+        others += [f"{path.relative_to(source).as_posix()}{more}" for path in found[:1]]
     if others:
         order = ", ".join(kind.name for kind in READERS[1:])
         lines.append(f"{source}: read as {reader.name}; not read: {', '.join(others)} (order of preference: {order})")
@@ -210,5 +216,6 @@ def other_inputs(source: Path, reader: Reader) -> list[str]:
         above = source.absolute().parent
         beside = [above / "sparse"] if models_below(above / "sparse") else []
         beside += [path for path in json_files(above) if path.name.startswith("transforms")]
-        lines += [f"{path} holds poses that are not read; give {above} to use them" for path in beside]
+        beside += [path for folder in below[1:] for path in sorted(folder.glob("transforms*.json"))]
+        lines += [f"{path} holds poses that are not read; give {path.parent} to use them" for path in beside]
     return lines

@@ -175,11 +175,16 @@ def _leave_out_pictures_of_photos(looks: list[_Look]) -> None:
     """Marks what lies in folders of NO_PHOTOS where a photo of that name lies elsewhere: "masks/1.jpg.png"."""
     of_photos = [look for look in looks if NO_PHOTOS.search(Path(look.name).parent.as_posix())]
     marked = {look.name for look in of_photos}
-    stems = {Path(look.name).stem.casefold() for look in looks if look.name not in marked}
+    stems = {_stem(look.name) for look in looks if look.name not in marked}
     for look in of_photos:
-        stem = Path(look.name).stem.casefold()
-        if stems & {stem, Path(stem).stem}:
+        if _stem(look.name) in stems:
             look.why = "by its folder a mask, depth or the like of a photo, and none itself"
+
+
+def _stem(name: str) -> str:
+    """The name of a photo without folder and suffix, or both suffixes of "1.jpg.png", in small letters."""
+    stem = Path(name.casefold()).stem
+    return Path(stem).stem if Path(stem).suffix in SUFFIXES else stem
 
 
 def _leave_out_panoramas(looks: list[_Look]) -> None:
@@ -222,16 +227,18 @@ def _leave_out_doubles(looks: list[_Look]) -> None:
 
 
 def _leave_out_copies(looks: list[_Look]) -> None:
-    """Marks photos that show the same as a larger one of the same name elsewhere, such as `images_4/1.jpg` beside
-    `images/1.jpg`. Photos of equal size stay: they may be of two cameras."""
+    """Marks photos that show the same as one of the same name elsewhere, of their size or larger, such as
+    `images_4/1.jpg` beside `images/1.jpg`, or the undistorted one."""
     alike: dict[str, list[_Look]] = {}
     for look in sorted(looks, key=lambda look: -look.size[0] * look.size[1]):
-        larger = alike.setdefault(Path(look.name).stem.casefold(), [])
-        copied = next((other for other in larger if other.size != look.size and _is_copy(look, other)), None)
+        larger = alike.setdefault(_stem(look.name), [])
+        others = (other for other in larger if other.size != look.size or other.path.parent != look.path.parent)
+        copied = next((other for other in others if _is_copy(look, other)), None)
         if copied is None:
             larger.append(look)
         else:
-            look.why = f"a double: the same picture as {copied.name} at another size"
+            at = " at another size" if look.size != copied.size else ""
+            look.why = f"a double: the same picture as {copied.name}{at}"
 
 
 def _is_copy(small: _Look, large: _Look) -> bool:

@@ -78,7 +78,8 @@ def _too_few(folder: Path, chosen: PhotoSet) -> InputError:
         first = chosen.left_out[0]
         found += f" that can be used ({len(chosen.left_out)} left out: {first['name']}: {first['why']})"
     elif not chosen.photos:
-        return InputError(f"{found}; expected .jpg, .heic, .png, .tif, .bmp or .webp files" + "".join(chosen.notes[:1]))
+        expected = "expected .jpg, .heic, .png, .tif, .bmp or .webp files, or a video itself"
+        return InputError("; ".join([found, expected, *chosen.notes[:1]]))
     return InputError(f"{found}; at least {MIN_PHOTOS} are needed, 20 or more give good maps")
 
 

@@ -316,6 +316,28 @@ def test_poses_of_other_programs_are_named(tmp_path: Path) -> None:
     assert f"{tmp_path / 'in' / 'sparse'} holds poses" in line
 
 
+@pytest.mark.parametrize(
+    "name",
+    ["keyframes/cameras/0.json", "metadata.json", "odometry.csv", "images/0.xmp", "opensfm/reconstruction.json"],
+)
+def test_poses_of_phones_and_of_programs_in_folders_are_named(name: str, tmp_path: Path) -> None:
+    """Polycam, Record3D, Stray Scanner, RealityScan, ODM."""
+    photo(tmp_path / "images" / "0.png")
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / name).write_text("{}")
+    (line,) = other_inputs(tmp_path, reader_of(tmp_path))
+    assert f"read as photos; not read: {name} (" in line
+
+
+def test_a_transforms_json_in_a_folder_below_is_named(tmp_path: Path) -> None:
+    transforms(tmp_path / "scan")
+    (line,) = other_inputs(tmp_path, reader_of(tmp_path))
+    assert (
+        line
+        == f"{tmp_path / 'scan/transforms.json'} holds poses that are not read; give {tmp_path / 'scan'} to use them"
+    )
+
+
 def test_images_without_their_lines_of_points_are_refused(tmp_path: Path) -> None:
     """Every second photo was taken for points, and not told."""
     source = workspace(tmp_path)

@@ -308,6 +308,23 @@ def test_smaller_copies_beside_the_photos_are_doubles(folder: str, tmp_path: Pat
     assert "4 of 8 photos are doubles" in chosen.notes[0]
 
 
+def test_undistorted_and_original_photos_of_one_size_are_doubles(tmp_path: Path) -> None:
+    """As Polycam keeps them, and ODM under another ending; what two cameras of a rig see stays."""
+    import cv2
+
+    K = np.array([[160, 0, 80], [0, 160, 60], [0, 0, 1.0]])
+    for index in range(4):
+        save(tmp_path / "images" / f"{index}.jpg", index)
+        undistorted = cv2.undistort(texture(index), K, np.array([0.01, 0, 0, 0]))
+        for copy in (f"corrected_images/{index}.jpg", f"undistorted/images/{index}.jpg.png"):
+            (tmp_path / copy).parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(undistorted).save(tmp_path / copy)
+        save(tmp_path / "right" / f"{index}.jpg", 100 + index)
+    chosen = choose_photos(tmp_path, True, Told())
+    assert len(chosen.names) == 8 and sum(name.startswith("right/") for name in chosen.names) == 4
+    assert all("a double: the same picture as" in entry["why"] for entry in chosen.left_out)
+
+
 def test_photos_of_one_name_that_show_different_things_all_stay(tmp_path: Path) -> None:
     """As of two cameras: of equal size, or of another size and another view."""
     save(tmp_path / "left" / "0.png", 0)

@@ -103,6 +103,12 @@ def test_files_that_are_no_video(tmp_path: Path) -> None:
         load_scene(file, ReadOptions(tmp_path / "work", frames=tmp_path / "v.frames"))
 
 
+def test_a_folder_of_videos_says_what_to_give(tmp_path: Path) -> None:
+    (tmp_path / "v.mp4").write_bytes(b"x")
+    with pytest.raises(InputError, match=r"files, or a video itself; 1 videos beside the photos .*: v\.mp4$"):
+        load_scene(tmp_path, ReadOptions(tmp_path / "w"))
+
+
 def test_names_that_are_no_utf8(tmp_path: Path) -> None:
     """OpenCV crashes on such a path; frames are written where the map is, under any name."""
     video = write_video(tmp_path / "v.mp4", pan(30))
