@@ -11,6 +11,7 @@ from perception.inputs.readers import JSON, PhotoSizes, other_inputs, reader_of
 from perception.inputs.start_cloud import check_seen, start_points
 from perception.photos.camera_file import read_camera
 from perception.photos.ignore_masks import with_checked_masks
+from perception.photos.lens import lens_warnings, pinhole_from_lens
 from perception.sfm.options import ReadOptions
 from perception.types import Scene
 
@@ -29,6 +30,8 @@ def load_scene(source: Path, options: ReadOptions) -> Scene:
     if masks is not None and not masks.is_dir():
         raise InputError(f"{masks}: no such folder of masks")
     lens, start = None if camera is None else read_camera(camera), None if cloud is None else start_points(cloud)
+    if lens is not None:
+        pinhole_from_lens(lens)  # refuses what describes no camera, before any work
     options = replace(options, lens=lens, cloud=start or options.cloud)
     options.workdir.mkdir(parents=True, exist_ok=True)
     scene = reader.read(source, options)
@@ -36,6 +39,7 @@ def load_scene(source: Path, options: ReadOptions) -> Scene:
     if masks is None and reader.name != JSON and (source / "masks").is_dir():
         notes.append(f"{source / 'masks'} is not read; to ignore what is black there, give --ignore-masks")
     scene.report["notes"] = [*notes, *scene.report.get("notes", [])]
+    scene.report["warnings"] += [f"{camera}: {line}" for line in (lens_warnings(lens) if lens else [])]
     if cloud is not None:
         scene.report["points_from"] = str(cloud)
     if reader.poses and len(scene.points):

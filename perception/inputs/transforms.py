@@ -205,6 +205,7 @@ def _views(
 ) -> tuple[list[View], list[dict[str, str]], list[str]]:
     """Views sorted by name, what is left out, and notes."""
     views, missing, notes, photos = dict[str, View](), list[dict[str, str]](), set[str](), dict[int, Path]()
+    again = list[str]()
     for index, values in enumerate(frame.values for frame in frames):
         photo = listing.find(str(values.get("file_path")))
         why = "listed, but the photo is missing" if photo is None else why_left_out(photo, options.strict)
@@ -221,7 +222,7 @@ def _views(
         frame, name = frames[index], safe_name(absolute(photo).relative_to(root).as_posix(), file)
         values = frame.values
         if name in views:
-            notes.add(f"{name} is listed more than once; the first pose is used")
+            again.append(name)
             continue
         posed = None
         with leaving_out(missing, name, options.strict):
@@ -235,6 +236,9 @@ def _views(
             mask = listing.needed(frame.file, "mask", values["mask_path"])
         views[name] = replace(view, depth=_depth(frame.file, values, listing), mask=mask, held_out=frame.held_out)
         notes.update(lines)
+    if again:
+        what = f"{again[0]} is" if len(again) == 1 else f"{len(again)} photos, such as {again[0]}, are"
+        notes.add(f"{what} listed more than once; the first pose is used")
     return [views[name] for name in sorted(views)], missing, sorted(notes)
 
 

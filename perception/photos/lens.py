@@ -103,7 +103,7 @@ def pinhole_from_lens(lens: Lens) -> tuple[tuple[float, float, float, float], in
             f"camera {lens.model} {list(lens.params)}: seen as a pinhole of focal lengths {fx:g}, {fy:g} "
             f"and centre {cx:g}, {cy:g}; expected {least:g} to {MOST_PIXELS:g} and at most {MOST_PIXELS:g} pixels"
         )
-    if min(x, y) >= 0 and max(x, y) < min(1, lens.width / 8, lens.height / 8):
+    if min(x, y) >= 0 and max(x, y) <= min(1, lens.width / 8, lens.height / 8):
         found = f"camera {lens.model} {list(lens.params)}: its principal point is ({x:g}, {y:g})"
         raise InputError(f"{found}, expected pixels, about ({lens.width / 2:g}, {lens.height / 2:g})")
     width, height = int(ideal.width), int(ideal.height)

@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 
 from perception.errors import InputError
+from perception.inputs.load import load_scene
+from perception.photos.camera_file import camera_data, write_camera
 from perception.photos.lens import lens_warnings, load_pycolmap
+from perception.sfm.options import ReadOptions
 from perception.types import Lens
 from support.given_poses import NAMES, check_poses, loaded, numbers, photo, pose, transforms, workspace
 
@@ -134,6 +137,27 @@ def test_a_principal_point_of_photos_of_another_size_is_told(tmp_path: Path) -> 
         photo(tmp_path / "images" / name, index, (32, 24))
     (line,) = loaded(tmp_path).report["warnings"]
     assert "principal point (32, 24) lies far from the middle" in line
+
+
+@pytest.mark.parametrize("centre", [0, 0.5])
+def test_a_camera_file_with_its_principal_point_in_the_corner_is_refused_at_once(centre: float, tmp_path: Path) -> None:
+    for index, name in enumerate(NAMES):
+        photo(tmp_path / "in" / name, index)
+    data = camera_data("x", (64, 48), "plumb_bob", [60, 0, centre, 0, 60, centre, 0, 0, 1], [0.0] * 5)
+    write_camera(tmp_path / "camera.yaml", data)
+    with pytest.raises(InputError, match=r"expected pixels, about \(32, 24\)"):
+        load_scene(tmp_path / "in", ReadOptions(tmp_path / "work", camera=tmp_path / "camera.yaml"))
+    assert not (tmp_path / "work").exists()
+
+
+def test_photos_that_are_listed_twice_are_told_in_one_line(tmp_path: Path) -> None:
+    data = transforms(tmp_path / "in")
+    data["frames"] += data["frames"]
+    (tmp_path / "in" / "transforms.json").write_text(json.dumps(data))
+    scene = loaded(tmp_path / "in")
+    check_poses(scene)
+    told = "8 photos, such as 0.png, are listed more than once; the first pose is used"
+    assert scene.report["warnings"] == [told]
 
 
 def test_resized_photos_are_told_in_one_line(tmp_path: Path) -> None:
