@@ -21,6 +21,11 @@ MIN_FEATURES = 450
 FEW_FEATURES = 50
 """Photos with fewer, at double size, are blank, dark or blurred: no more effort registers them."""
 PEAK_THRESHOLD = 0.004
+FOCAL_LENGTHS, USUAL = (0.22, 10.0), 1.2
+"""Range of focal lengths by EXIF that are taken, as shares of the long side: 8 to 360 mm on film of 35 mm. A manual
+lens gives 0, some phones their true millimetres. The share where EXIF says nothing, as COLMAP's."""
+_FULL_SIZE = (0xA002, 0xA003)
+"""EXIF tags: width and height of the photo when it was taken, in pixels."""
 PAIRS_AT_ONCE = 2000
 """Pairs between two steps of the progress bar."""
 
@@ -51,7 +56,38 @@ def import_photos(
     pycolmap.Database.open(database).close()  # creates the file
     for group in groups:
         pycolmap.import_images(database, root, pycolmap.CameraMode.SINGLE, *group)
+    _check_focal_lengths(database, {n: p for n, p, lens in zip(names, photos, lenses, strict=True) if lens is None})
     return groups
+
+
+def _check_focal_lengths(database: Path, photos: dict[str, Path]) -> None:
+    """Corrects focal lengths that pycolmap has read from EXIF, or drops them. photos: by name, without a known lens."""
+    seen = set[int]()
+    with load_pycolmap().Database.open(database) as db:
+        for name, photo in photos.items():
+            if (number := db.read_image_with_name(name).camera_id) in seen:
+                continue
+            seen.add(number)
+            camera = db.read_camera(number)
+            if not camera.has_prior_focal_length:
+                continue
+            side = max(camera.width, camera.height)
+            focal = camera.focal_length * _resized_since(photo, side)
+            known = FOCAL_LENGTHS[0] <= focal / side <= FOCAL_LENGTHS[1]
+            if not known or focal != camera.focal_length:
+                camera.focal_length = focal if known else USUAL * side
+                camera.has_prior_focal_length = known
+                db.update_camera(camera)
+
+
+def _resized_since(photo: Path, side: int) -> float:
+    """The long side in pixels over that when the photo was taken, where pycolmap has the focal length by the sensor's
+    pixels per inch or centimetre; these stay in EXIF when a photo is resized. 1 where it has it otherwise."""
+    with open_photo(photo) as image:
+        details = exif_of(image, photo, CAMERA_FOLDER)
+    full = max((size for tag in _FULL_SIZE if isinstance(size := details.get(tag), int)), default=0)
+    of_film, of_sensor = details.get(0xA405), details.get(0xA20E)
+    return side / full if full > 0 and of_sensor and not of_film and details.get(0xA210, 2) in (2, 3) else 1.0
 
 
 def camera_groups(root: Path, photos: list[Path], names: list[str], lenses: list[Lens | None]) -> list[Group]:
