@@ -97,5 +97,5 @@ def what_is_wrong(name: object) -> str | None:
         return 'leaves its folder by ".."'
     if found := _CONTROL.search(name):
         code = ord(found.group())
-        return "is not in UTF-8" if 0xD800 <= code < 0xE000 else f"holds the character U+{code:04X}"
+        return f"holds the character U+{code:04X}{', so is not in UTF-8' if 0xD800 <= code < 0xE000 else ''}"
     return None
