@@ -40,7 +40,7 @@ def models_below(folder: Path) -> list[Path]:
     for path in folders_below(folder, DEPTH):
         inside = path.relative_to(folder).parts
         if any((path / f"images.{kind}").is_file() for kind in ("bin", "txt")):
-            in_sparse = _SPARSE in inside[-2:]
+            in_sparse = _SPARSE in inside
             has_cameras = any((path / f"cameras.{kind}").is_file() for kind in ("bin", "txt"))
             if in_sparse or (has_cameras and len(inside) < DEPTH):
                 found.append((inside[:1] != (_SPARSE,), len(inside), path))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import codecs
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from struct import Struct
@@ -38,6 +38,7 @@ _COUNT, _FLAG, _SENSOR, _POSE = Struct("<Q"), Struct("<B"), Struct("<iI"), Struc
 _STILL = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 _NO_NUMBER = re.compile(r"[+-]?(nan|inf|\d\.?#)", re.IGNORECASE)
 """What C++ writes for numbers that are not finite: "-nan(ind)", "inf", "1.#QNAN"."""
+_NOT_FINITE = re.compile(rb"nan|inf|#", re.IGNORECASE)
 _COMMA = "has a decimal comma; export the model again with decimal points"
 
 
@@ -145,24 +146,26 @@ def _loaded(model: Model) -> Any:
 def _checked_text(model: Model, bare: bool = False) -> dict[int, int]:
     """The camera of each image of a text model; fills in what is wrong, and copies where pycolmap cannot read it.
     bare: copies without observations."""
-    cameras, images, frames, used = list[str](), list[str](), list[str](), dict[int, int]()
+    cameras, images, frames, used = dict[int, str](), list[str](), list[str](), dict[int, int]()
+    marked = False
     for start, line in _lines(model, "cameras"):
         number, kind, *rest = line.split() if len(line.split()) > 1 else (line, "")
-        if not model.judge("cameras", _id(number, start), _numbers(rest, start)):
+        if not model.judge("cameras", _id(number, start, cameras), values := _numbers(rest, start)):
             rest[2:] = ["1"] * len(rest[2:])
+        elif not all(text.isdigit() for text in rest[:2]):  # "640.0"
+            marked, rest[:2] = True, [f"{value:.0f}" for value in values[:2]]
         found = f"camera {number} of model {brief(kind)} with {len(rest[2:])} parameters is not known to COLMAP"
         with refusing(f"{start}: {found}; expected as in its documentation, Camera Models"):
             if not load_pycolmap().Camera(model=kind, params=[1.0] * len(rest[2:])).verify_params():
                 raise ValueError
-        cameras.append(" ".join([number, kind, *rest]))
-    known = [line.partition(" ")[0] for line in cameras]
+        cameras[int(number)] = " ".join([number, kind, *rest])
     for start, fields, points in _text_images(model):
-        image_id = _id(fields[0], start)
+        image_id = _id(fields[0], start, used)
         if not model.judge("images", image_id, _numbers(fields[1:8], start)):
             fields[1:8] = map(str, _STILL)
-        if fields[8] not in known:
-            raise InputError(f"{start}: image {image_id} has camera {fields[8]}, which cameras.txt lacks")
         used[image_id] = _id(fields[8], start)
+        if used[image_id] not in cameras:
+            raise InputError(f"{start}: image {image_id} has camera {fields[8]}, which cameras.txt lacks")
         images += [" ".join([*fields[:9], fields[0]]), "" if bare else points]
     for start, line in _lines(model, "frames"):
         fields = line.split()
@@ -176,15 +179,15 @@ def _checked_text(model: Model, bare: bool = False) -> dict[int, int]:
     if raw["points3D"].find(b",", _start(raw["points3D"])) >= 0:
         raise InputError(f"{model.file('points3D')}: {_COMMA}")
     blanks = any(re.search(r"\s", name) for name in model.names.values())
-    marked = b"1.#" in raw["points3D"] or any(not data[:1].isascii() for data in raw.values())
+    marked |= any(not data[:1].isascii() for data in raw.values())
+    marked |= _NOT_FINITE.search(raw["points3D"], _start(raw["points3D"])) is not None
     if blanks or marked or not whole or model.wrong or model.cameras or model.frames:
         text = {kind: text_of(data, "replace") for kind, data in raw.items()}
-        text |= {"cameras": "\n".join(cameras), "images": "\n".join(images)}
+        text |= {"cameras": "\n".join(cameras.values()), "images": "\n".join(images)}
         text |= {"frames": "\n".join(frames)} if frames else {}
-        text["points3D"] = re.sub(r"-?1\.#\w+", "nan", text["points3D"])
-        if bare:
-            rows = (line.split() for line in text["points3D"].splitlines() if not line.startswith("#"))
-            text["points3D"] = "\n".join(" ".join([*row[:7], "0"]) for row in rows if row)
+        rows = [line.split() for line in text["points3D"].splitlines() if not line.startswith("#")]
+        rows = [row for row in rows if not any(map(_NO_NUMBER.match, row[1:4]))]
+        text["points3D"] = "\n".join(" ".join([*row[:7], "0"] if bare and row else row) for row in rows)
         model.copies = {kind: bytearray(f"{content}\n", "utf-8") for kind, content in text.items()}
     return used
 
@@ -227,9 +230,11 @@ def _lines(model: Model, kind: str) -> Iterator[tuple[str, str]]:
         yield f"{file}: line {number}", line
 
 
-def _id(text: str, start: str) -> int:
+def _id(text: str, start: str, taken: Collection[int] = ()) -> int:
     if not (text.isascii() and text.isdigit()):
         raise InputError(f"{start}: the id {brief(text)} is no whole number")
+    if int(text) in taken:
+        raise InputError(f"{start}: the id {text} occurs twice")
     return int(text)
 
 

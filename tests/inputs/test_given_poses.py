@@ -28,6 +28,7 @@ from support.given_poses import CAMERA, NAMES, SIZE, check_poses, loaded, photo,
 PLACES = [
     ("sparse/0", "images"),
     ("sparse", "images"),
+    ("sparse/0/0", "images"),
     (".", "."),
     (".", "images"),
     ("colmap/sparse/0", "images"),

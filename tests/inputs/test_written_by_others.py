@@ -16,7 +16,7 @@ from perception.photos.camera_file import camera_data, write_camera
 from perception.photos.lens import lens_warnings, load_pycolmap
 from perception.sfm.options import ReadOptions
 from perception.types import Lens
-from support.given_poses import NAMES, check_poses, loaded, numbers, photo, pose, transforms, workspace
+from support.given_poses import CAMERA, NAMES, check_poses, loaded, numbers, photo, pose, transforms, workspace
 
 TURNED = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -56,6 +56,28 @@ def test_a_model_without_a_file_of_points(kind: str, tmp_path: Path) -> None:
     scene = loaded(folder)
     check_poses(scene)
     assert "holds 0 points; new ones are triangulated" in scene.report["warnings"][0]
+
+
+@pytest.mark.parametrize("value", ["nan", "-nan(ind)", "inf", "1.#QNAN"])
+def test_points_that_are_not_finite_are_left_out(value: str, tmp_path: Path) -> None:
+    folder = workspace(tmp_path / "in")
+    with (folder / "sparse/0/points3D.txt").open("a") as file:
+        file.write(f"901 1 {value} 1 1 2 3 0\n902 0.1 0.2 0.3 1 2 3 0\n")
+    points = loaded(folder).points
+    assert len(points) == 61 and np.isfinite(points).all() and points[-1].tolist() == [0.1, 0.2, 0.3]
+
+
+def test_sizes_with_a_decimal_point(tmp_path: Path) -> None:
+    check_poses(loaded(workspace(tmp_path / "in", cameras="1 PINHOLE 64.0 48.0 60 61 32 24")))
+
+
+@pytest.mark.parametrize("file", ["cameras", "images"])
+def test_an_id_that_occurs_twice_is_told_with_its_line(file: str, tmp_path: Path) -> None:
+    workspace(tmp_path / "in", cameras=f"{CAMERA}\n{CAMERA}" if file == "cameras" else CAMERA)
+    target = tmp_path / "in/sparse/0/images.txt"
+    target.write_text(target.read_text().replace("\n2 ", "\n1 ") if file == "images" else target.read_text())
+    with pytest.raises(InputError, match=rf"{file}\.txt: line 4: the id 1 occurs twice$"):
+        loaded(tmp_path / "in")
 
 
 def test_tabs_between_values(tmp_path: Path) -> None:
