@@ -42,7 +42,7 @@ def load_scene(source: Path, options: ReadOptions) -> Scene:
     scene.report["warnings"] += [f"{camera}: {line}" for line in (lens_warnings(lens) if lens else [])]
     if cloud is not None:
         scene.report["points_from"] = str(cloud)
-    if reader.poses and len(scene.points):
+    if reader.poses and len(scene.points) and (start or options.cloud is None):  # not the points of a map
         check_seen(scene, cloud or source)
     scene = with_checked_masks(scene, masks)
     scene.report["seconds"]["total"] = time.perf_counter() - started
