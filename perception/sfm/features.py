@@ -142,10 +142,12 @@ def _drop_poor(database: Path, names: list[str]) -> list[str]:
 
 
 def _camera_key(photo: Path) -> tuple[Any, ...]:
-    """Key of photos that share one camera: size, and EXIF maker, model, focal length and zoom (as text: 0/0 is NaN)."""
+    """Key of photos that share one camera: size, and EXIF maker, model, focal length, the same on film, and zoom (as
+    text: 0/0 is NaN). A phone that cuts the middle out of its sensor may state it by the second alone."""
     with open_photo(photo) as image:
         exif, details = exif_of(image, photo), exif_of(image, photo, CAMERA_FOLDER)
-    return (*photo_size(photo), exif.get(0x010F), exif.get(0x0110), str(details.get(0x920A)), str(details.get(0xA404)))
+    lens = (str(details.get(tag)) for tag in (0x920A, 0xA405, 0xA404))
+    return (*photo_size(photo), exif.get(0x010F), exif.get(0x0110), *lens)
 
 
 def match(

@@ -10,7 +10,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from perception.photos.lens import load_pycolmap
-from perception.sfm.features import import_photos
+from perception.sfm.features import camera_groups, import_photos
 from perception.types import Lens
 
 SIZE = (640, 480)
@@ -65,6 +65,17 @@ def test_focal_lengths_of_photos_as_they_were_taken(tmp_path: Path) -> None:
 def test_focal_lengths_that_no_lens_has_say_nothing(tags: dict[int, Any], tmp_path: Path) -> None:
     camera = camera_of(tmp_path, tags)
     assert not camera.has_prior_focal_length and camera.focal_length == pytest.approx(1.2 * 640)
+
+
+def test_a_cut_sensor_is_another_camera(tmp_path: Path) -> None:
+    """Twice the zoom by the same lens: the focal length in millimetres is the same, that on film is not."""
+    for index, film in enumerate((26, 52, 26)):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769).update({MILLIMETRES: IFDRational(686, 100), FILM: film})
+        Image.new("RGB", SIZE, (index, 90, 90)).save(tmp_path / f"{index}.jpg", exif=exif)
+    photos = [tmp_path / f"{index}.jpg" for index in range(3)]
+    groups = camera_groups(tmp_path, photos, [photo.name for photo in photos], [None] * 3)
+    assert [names for names, _ in groups] == [["0.jpg", "2.jpg"], ["1.jpg"]]
 
 
 def test_a_known_lens_stays(tmp_path: Path) -> None:
