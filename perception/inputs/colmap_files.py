@@ -38,7 +38,8 @@ _COUNT, _FLAG, _SENSOR, _POSE = Struct("<Q"), Struct("<B"), Struct("<iI"), Struc
 _STILL = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 _NO_NUMBER = re.compile(r"[+-]?(nan|inf|\d\.?#)", re.IGNORECASE)
 """What C++ writes for numbers that are not finite: "-nan(ind)", "inf", "1.#QNAN"."""
-_NOT_FINITE = re.compile(rb"nan|inf|#", re.IGNORECASE)
+_LETTERS = re.compile(rb"[nNiI#]")
+"""Of these, in a file of numbers."""
 _COMMA = "has a decimal comma; export the model again with decimal points"
 
 
@@ -180,7 +181,7 @@ def _checked_text(model: Model, bare: bool = False) -> dict[int, int]:
         raise InputError(f"{model.file('points3D')}: {_COMMA}")
     blanks = any(re.search(r"\s", name) for name in model.names.values())
     marked |= any(not data[:1].isascii() for data in raw.values())
-    marked |= _NOT_FINITE.search(raw["points3D"], _start(raw["points3D"])) is not None
+    marked |= _LETTERS.search(raw["points3D"], _start(raw["points3D"])) is not None
     if blanks or marked or not whole or model.wrong or model.cameras or model.frames:
         text = {kind: text_of(data, "replace") for kind, data in raw.items()}
         text |= {"cameras": "\n".join(cameras.values()), "images": "\n".join(images)}
