@@ -35,8 +35,11 @@ SEAM, LEAST_SEAM = 2.0, 8.0
 do; their least standard deviation, in grey levels, for which this says something."""
 BLURRED = 0.1
 """Share of the median sharpness (variance of the thumbnail's Laplacian) below which a photo is reported as blurred."""
-NO_PHOTOS = re.compile("mask|depth|normal|label|confidence|segment", re.IGNORECASE)
-"""In names of folders whose pictures are of photos elsewhere."""
+NO_PHOTOS = re.compile(
+    r"(?<![a-z])(masks?|depths?|depth_?maps?|normals|labels?|confidence|segmentations?|semantics?)(?![a-z])",
+    re.IGNORECASE,
+)
+"""Words in names of folders whose pictures are of photos elsewhere."""
 _HIDDEN = (".", "@eaDir", "#recycle", "#snapshot", "$RECYCLE.BIN", "__MACOSX")
 """How names of files and folders begin that belong to the system."""
 _SHOWN = 5

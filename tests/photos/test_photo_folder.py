@@ -163,6 +163,12 @@ def test_masks_beside_the_photos_are_no_photos(folder: str, tmp_path: Path) -> N
     assert any("3 of 7 photos are by their folders masks" in note for note in chosen.notes)
 
 
+def test_photos_in_folders_of_like_names_stay(tmp_path: Path) -> None:
+    for index, folder in enumerate(("wide", "normal", "unmasked", "segment_2")):
+        save(tmp_path / folder / "IMG_1.jpg", index)
+    assert len(choose_photos(tmp_path, True, Told()).names) == 4
+
+
 def test_folders_of_the_system_hold_no_photos(tmp_path: Path) -> None:
     """Synology keeps a thumbnail of each photo in a folder of the photo's name, and what was deleted in #recycle."""
     for name in ("a.jpg", "@eaDir/a.jpg/SYNOPHOTO_THUMB_XL.jpg", "#recycle/b.jpg", "$RECYCLE.BIN/c.jpg", "#1.jpg"):
