@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from perception.errors import InputError
 from perception.geometry import camera_centres, nearest_rotation
 from perception.photos.views import view_lens
 from perception.posed.bundle_adjustment import Poses, adjust, residuals, starting_points
@@ -27,6 +29,19 @@ PARTS, LEAST_OF_PART, AGREED = 4, 20, 0.75
 picture that have LEAST_OF_PART features. A thing that moves with the camera drags the poses, but fits only its part."""
 UNIT = 1.5
 """Depth is left out if the median ratio of triangulated to measured depth is farther from 1 than this factor."""
+AS_DISTANCE = 0.5
+"""Depth is left out if taking it for distances along the rays lowers its median relative error to this share."""
+LIKELY = 0.5
+"""Given poses that do not fit are refused if another reading of them lowers their error to this share."""
+_BACK, _BODY = np.diag([1.0, -1, -1]), np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+"""Axes of a camera (right, down, forward) from those of OpenGL (right, up, back); those of a ROS body from them."""
+_READINGS = (  # (what the poses may be, whether they are inverted, axes that they have from those of a camera)
+    ("of cameras whose y and z axes point the other way, as those of OpenGL and of OpenCV do", False, _BACK),
+    ("of bodies with x forward and z up, as ROS has them, not of cameras with z forward", False, _BODY),
+    ("of bodies with x forward and z up, as ROS has them, not of cameras with z forward", False, _BACK @ _BODY),
+    ("camera_from_world in place of world_from_camera", True, np.eye(3)),
+    ("camera_from_world in place of world_from_camera", True, _BACK),
+)
 
 
 def poses_of(views: list[View]) -> Poses:
@@ -57,7 +72,7 @@ def match_errors(features: Features, poses: Poses) -> tuple[np.ndarray, np.ndarr
 def checked_poses(views: list[View], features: Features, mode: str) -> tuple[list[View], dict[str, Any]]:
     """`views` as given or with refined poses, and the report's entries: "poses", "notes", "warnings".
     mode: "auto" refines poses that are worse than TOLERANCE, "refine" any that gain by it. Views that are held out for
-    scoring are refined as well, by features and depth alone."""
+    scoring are refined as well, by features and depth alone. InputError for poses that fit in another convention."""
     given = poses_of(views)
     if len(features.pairs) < LEAST_MATCHES:
         note = f"given poses not checked: {len(features.pairs)} matched features, {LEAST_MATCHES} are needed"
@@ -67,13 +82,17 @@ def checked_poses(views: list[View], features: Features, mode: str) -> tuple[lis
     facts: dict[str, Any] = {"refined": False, "given_error_px": before}
     notes, warnings = [f"given poses: matched features {_text(before)}"], list[str]()
     report = {"poses": facts, "notes": notes, "warnings": warnings}
-    usable, unit = views, _depth_unit(features, given)
-    if not 1 / UNIT < unit < UNIT:
-        what = f"features triangulate at {unit:.3g} times their measured depth, as if in another unit than the poses"
-        warnings.append(f"{what}; depth is not used")
+    usable, fault = views, _depth_fault(features, given)
+    if fault is not None:
+        warnings.append(f"{fault}; depth is not used")
         usable, features = [replace(v, depth=None) for v in views], replace(features, depth=0 * features.depth)
     if mode == "auto" and before["epipolar"] <= good:
         return usable, report
+    if before["epipolar"] > HOPELESS * good:
+        error, meant = min((_medians(features, read)["epipolar"], text) for text, read in _readings(given))
+        if error <= min(LIKELY * before["epipolar"], HOPELESS * good):
+            found = f"the given poses do not fit the photos: {_text(before)}; {error:.2f} px if they are {meant}"
+            raise InputError(f"{found}; correct them, or take them as they are with --set photos.poses=keep")
     refined = refine(features, given)
     after, (changes, text) = _medians(features, refined), _changes(refined.since(given))
     better = after["epipolar"] <= min(IMPROVED * before["epipolar"], HOPELESS * good)
@@ -91,6 +110,16 @@ def checked_poses(views: list[View], features: Features, mode: str) -> tuple[lis
         return usable, report
     warning = "the given poses do not fit the photos, and refining them did not help; they are used as they are"
     return views, {**report, "warnings": [warning]}
+
+
+def _readings(given: Poses) -> Iterator[tuple[str, Poses]]:
+    """What the given poses may be, and the cameras' poses if they are that, up to a rotation of the world."""
+    for text, inverted, axes in _READINGS:
+        rotation, center = given.rotation, given.center
+        if inverted:
+            center = -np.einsum("nij,nj->ni", rotation, center)
+            rotation = rotation.transpose(0, 2, 1)
+        yield text, Poses(axes.T @ rotation, center)
 
 
 def refine(features: Features, given: Poses) -> Poses:
@@ -132,13 +161,26 @@ def agreeing(features: Features, poses: Poses) -> np.ndarray:
     return np.asarray(good.reshape(2, -1).all(0))
 
 
-def _depth_unit(features: Features, poses: Poses) -> float:
-    """Median ratio of triangulated to measured depth; 1 without depth."""
+def _depth_fault(features: Features, poses: Poses) -> str | None:
+    """What tells, by triangulated features, that measured depth has another unit or is no depth; None without fault."""
     tracks = tracks_of(features, features.pairs[agreeing(replace(features, depth=0 * features.depth), poses)])
     blind = replace(tracks, depth=0 * tracks.depth)
     along = residuals(blind, poses, starting_points(blind, poses))[2][:, 2]
     known = (tracks.depth > 0) & (along > 0)
-    return float(np.median(along[known] / tracks.depth[known])) if known.any() else 1.0
+    if not known.any():
+        return None
+    ratio = along[known] / tracks.depth[known]
+    unit = float(np.median(ratio))
+    if not 1 / UNIT < unit < UNIT:
+        return f"features triangulate at {unit:.3g} times their measured depth, as if in another unit than the poses"
+    lengths = np.sqrt(1 + (tracks.rays[known] ** 2).sum(axis=1))  # of the rays to depth 1
+    wrong, right = (float(np.median(np.abs(each / np.median(each) - 1))) for each in (ratio, ratio * lengths))
+    if right < AS_DISTANCE * wrong:
+        found = (
+            f"depth is off by {wrong:.1%}, and by {right:.1%} if it is taken for the distance along each pixel's ray"
+        )
+        return f"{found}; convert it to depth along the optical axis"
+    return None
 
 
 def _medians(features: Features, poses: Poses) -> dict[str, float]:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from perception.errors import InputError
 from perception.geometry import align_similarity
 from perception.posed.bundle_adjustment import Poses, _linearised, _Problem, starting_points
 from perception.posed.pose_refinement import checked_poses, match_errors, moved_back, poses_of, refine
@@ -215,6 +216,39 @@ def test_depth_in_another_unit_is_left_out_with_a_warning(made):
     given, views, report = check(millimetres, right)
     assert "another unit" in report["warnings"][0]
     assert all(view.camera_from_world is old.camera_from_world for view, old in zip(views, given, strict=True))
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.0])
+def test_distances_along_the_rays_are_no_depth(made, noise):
+    """A renderer's distance to the camera's centre is √(1 + x² + y²) times the depth at the ray (x, y, 1)."""
+    rng, right, _ = made
+    features = seen(rng, truth(np.random.default_rng(3)), depth_noise=noise)
+    lengths = np.sqrt(1 + (features.rays**2).sum(axis=1))
+    given, views, report = check(replace(features, depth=features.depth * lengths), right)
+    assert "distance along each pixel's ray" in report["warnings"][0]
+    assert all(view.camera_from_world is old.camera_from_world for view, old in zip(views, given, strict=True))
+    assert not check(features, right)[2]["warnings"]
+
+
+BODY = np.array([[0, 0, 1.0, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # body_from_camera
+
+
+@pytest.mark.parametrize(
+    ("told", "written"),
+    [
+        ("y and z axes point the other way", lambda pose: pose @ np.diag([1.0, -1, -1, 1])),
+        ("of bodies with x forward", lambda pose: pose @ np.linalg.inv(BODY)),
+        ("of bodies with x forward", lambda pose: pose @ np.linalg.inv(BODY) @ np.diag([1.0, -1, -1, 1])),
+        ("camera_from_world in place of", np.linalg.inv),
+        ("camera_from_world in place of", lambda pose: np.linalg.inv(pose) @ np.diag([1.0, -1, -1, 1])),
+    ],
+)
+def test_poses_in_another_convention_are_refused_by_its_name(told, written):
+    rng = np.random.default_rng(3)
+    matrices = truth(rng)
+    read = np.stack([np.linalg.inv(written(np.linalg.inv(matrix))) for matrix in matrices])
+    with pytest.raises(InputError, match=f"do not fit the photos: .* if they are .*{told}.*photos.poses=keep"):
+        check(seen(rng, matrices), poses_of(views_at(read)))
 
 
 def test_poses_that_no_match_agrees_with_are_kept_with_a_warning():
