@@ -142,7 +142,7 @@ def write_depth(
         found = f"no image of {topic} lies within {APART} s of a photo (the nearest: {min(apart.values()):.3g} s)"
         raise InputError(f"{bag.path}: {found}; give another --depth, or --depth none")
     folder.mkdir()
-    written = dict[str, str]()
+    written, farthest = dict[str, str](), 0
     for one, depth in bag.decoded(topic, decode_depth, {nearest[name] for name in near}):
         there, size = frame_of(one.message), depth.shape[::-1]
         if own is not None and not same_aspect(size, (own.width, own.height)):
@@ -155,10 +155,15 @@ def write_depth(
                 raise InputError(f"{bag.path}: {topic} is not registered to the photos and lacks {lacks}")
             depth = registered(depth, own, lens, moved)
         stored = np.round(depth * MILLIMETRES)
-        data = cv2.imencode(".png", np.where(stored <= LARGEST, stored, 0).astype(np.uint16))[1].tobytes()
+        stored = np.where(stored <= LARGEST, stored, 0).astype(np.uint16)
+        farthest = max(farthest, int(stored.max()))
+        data = cv2.imencode(".png", stored)[1].tobytes()
         for name in (name for name in near if nearest[name] == one.number):
             written[name] = f"{folder.name}/{Path(name).stem}.png"
             (folder.parent / written[name]).write_bytes(data)
+    if not farthest:
+        found = f"{topic} measures nothing within {LARGEST / MILLIMETRES:.1f} m"
+        raise InputError(f"{bag.path}: {found}; expected metres as floats or millimetres as 16 bits (REP 118)")
     most = max(apart[name] for name in written)
     return written, f"{topic}, {len(written)} of {len(stamps)} photos, at most {1000 * most:.0f} ms apart"
 

@@ -74,7 +74,7 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
         if not numbers:
             raise InputError("; ".join([f"{source}: {topic} holds no images", *bag.lines()]))
         chosen = {numbers[index] for index in chooser.chosen(options.max_frames)}
-        poses = read_poses(bag, options.odometry)
+        poses = read_poses(bag, topic, options.odometry)
         with atomic_directory(output, fresh=True) as aside:
             if options.camera is None:
                 write_camera(aside / "camera.yaml", info)

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from array import array
 from dataclasses import dataclass
+from itertools import groupby, takewhile
 from sys import intern
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from perception.bags.read import ODOMETRY, TRANSFORMS, Bag, Recorded, stamp_of
+from perception.bags.read import IMU, ODOMETRY, TRANSFORMS, Bag, Recorded, stamp_of
 from perception.geometry import interpolated_pose, inverse_se3, transform
 
 FIXED_FRAMES = ("map", "odom", "world")
 MAX_GAP = 0.5
 """Maximum time in seconds between two samples of a moving frame for a pose to be interpolated."""
-IMU = "sensor_msgs/msg/Imu"
 G = 9.81
 STILL_TURN, STILL_PUSH = 0.5, 0.5
 """Largest rate of turn in rad/s and largest difference of the measured acceleration from G in m/s² of used samples."""
@@ -95,9 +95,22 @@ class Poses:
         return interpolated_pose(times, matrices, time, MAX_GAP * 1e9)
 
 
-def read_poses(bag: Bag, odometry: str | None = None) -> Poses:
+def nearest_first(topics: list[str], image: str) -> list[list[str]]:
+    """Topics in groups, the first of the namespace of the topic `image`: robots may use the same names of frames.
+    /r2/tf comes before /tf, and that before /r1/tf, for /r2/camera/image_raw."""
+
+    def apart(topic: str) -> tuple[int, int]:
+        own, other = (name.split("/")[1:-1] for name in (topic, image))
+        shared = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(own, other, strict=False)))
+        return -shared, len(own) - shared
+
+    return [list(group) for _, group in groupby(sorted(topics, key=apart), apart)]
+
+
+def read_poses(bag: Bag, image: str, odometry: str | None = None) -> Poses:
     """All transforms of a bag; odometry adds frames that tf does not define, that of the topic `odometry` comes before
-    tf. Of several topics with poses of one frame the first is taken: a filter on tf and wheel odometry differ."""
+    tf. Of several topics with poses of one frame the first is taken: a filter on tf and wheel odometry differ, and so
+    do two robots (see `nearest_first`; image: the topic of the photos)."""
     poses, topics = Poses(), bag.of_type(ODOMETRY)
 
     def add(one: Recorded, entry: Any, child: str, position: Any, quaternion: Any, static: bool = False) -> None:
@@ -108,7 +121,7 @@ def read_poses(bag: Bag, odometry: str | None = None) -> Poses:
         if one.topic not in used:
             used.append(one.topic)
         if one.topic == used[0]:
-            poses.add(entry.header.frame_id, child, stamp_of(entry), matrix, static)
+            poses.add(entry.header.frame_id, child, stamp_of(entry) or one.time, matrix, static)
 
     def add_odometry(topics: list[str]) -> None:
         for one in bag.messages(topics):
@@ -117,11 +130,13 @@ def read_poses(bag: Bag, odometry: str | None = None) -> Poses:
 
     if odometry is not None:
         add_odometry([bag.chosen(topics, odometry, "odometry", "--odometry")])
-    for one in bag.messages(bag.of_type(*TRANSFORMS)):
-        for entry in one.message.transforms:
-            static = one.topic.rstrip("/").endswith("static")
-            add(one, entry, entry.child_frame_id, entry.transform.translation, entry.transform.rotation, static)
-    add_odometry([topic for topic in topics if topic != odometry])
+    for group in nearest_first(bag.of_type(*TRANSFORMS), image):
+        for one in bag.messages(group):
+            for entry in one.message.transforms:
+                static = one.topic.rstrip("/").endswith("static")
+                add(one, entry, entry.child_frame_id, entry.transform.translation, entry.transform.rotation, static)
+    for group in nearest_first([topic for topic in topics if topic != odometry], image):
+        add_odometry(group)
     return poses
 
 

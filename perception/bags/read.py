@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from heapq import merge
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,9 +19,10 @@ from perception.photos.decode import read_picture
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-ODOMETRY = "nav_msgs/msg/Odometry"
+ODOMETRY, IMU = "nav_msgs/msg/Odometry", "sensor_msgs/msg/Imu"
 DEPTH_TRANSPORT = "compressedDepth"
 METADATA = "metadata.yaml"
+_READ = (*IMAGES, CAMERA_INFO, *TRANSFORMS, ODOMETRY, IMU)
 
 
 class Recorded(NamedTuple):
@@ -107,6 +109,7 @@ class Bag:
         ]
 
 
+_EXPECTED = "ROS 1's .bag, or ROS 2 messages in .db3 or .mcap (`rosbags-convert` makes these of a .bag)"
 _RECOVER = "mend it with `mcap recover`, `ros2 bag reindex` or `rosbag reindex`, or record it again"
 _WAL = "-wal"
 """Ends the name of SQLite's write-ahead log."""
@@ -131,20 +134,56 @@ def _storage(path: Path) -> list[Path]:
     return files
 
 
+class _Files:
+    """The open files of a bag. paths: ROS 1 .bag files or one of ROS 2. Messages are read by the bag's definitions of
+    their types, or by ROS's own where these are missing or wrong; those of types that are not read may be anything."""
+
+    def __init__(self, paths: list[Path]) -> None:
+        from rosbags.rosbag1 import Reader as Reader1
+        from rosbags.rosbag2 import Reader as Reader2
+
+        self.ros1 = paths[0].suffix == ".bag"
+        with ExitStack() as stack:
+            readers: list[Any] = [stack.enter_context((Reader1 if self.ros1 else Reader2)(path)) for path in paths]
+            self.connections = [connection for reader in readers for connection in reader.connections]
+            store = self._store()
+            self.deserialize = store.deserialize_ros1 if self.ros1 else store.deserialize_cdr
+            self.close = stack.pop_all().close
+
+    def messages(self, connections: list[Any]) -> Iterator[tuple[Any, int, bytes]]:
+        """(connection, time in ns, bytes) of all messages of `connections`, in order of time."""
+        owners = {id(connection.owner): connection.owner for connection in connections}
+        parts = (owner.messages([c for c in connections if c.owner is owner]) for owner in owners.values())
+        return merge(*parts, key=lambda part: part[1])
+
+    def _store(self) -> Any:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        types = dict(get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.LATEST).fielddefs)
+        for name in TRANSFORMS:
+            types |= get_types_from_msg("geometry_msgs/TransformStamped[] transforms", name)
+        for name, connection in {c.msgtype: c for c in self.connections if c.msgtype in _READ}.items():
+            with suppress(Exception):  # whatever a relay or a serial bridge wrote in place of the definition
+                own, store = get_types_from_msg(connection.msgdef.data, name), get_typestore(Stores.EMPTY)
+                store.register(own)
+                if own[name][1] and (not self.ros1 or store.generate_msgdef(name)[1] == connection.digest):
+                    types |= own
+        store = get_typestore(Stores.EMPTY)
+        store.register(types)
+        return store
+
+
 @contextmanager
 def open_bag(path: Path, strict: bool = False) -> Iterator[Bag]:
     """Opens a ROS 1 .bag, a ROS 2 bag folder, or an .mcap or .db3 file. InputError if it is none of these."""
     try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
+        import rosbags  # noqa: F401
     except ImportError as error:
         raise missing_extra("rosbags", "ros") from error
     if not path.exists():
         raise InputError(f"{path}: no such bag; expected a .bag, an .mcap, or the folder of a ROS 2 bag")
-    with refusing(f"{path}: is no bag that can be read ({{why}}); expected ROS 1, ROS 2 or MCAP; {_RECOVER}"):
-        store = None if path.suffix == ".bag" else get_typestore(Stores.LATEST)  # old ROS 2 bags lack definitions
-        reader = AnyReader(_storage(path), default_typestore=store)
-        reader.open()
+    with refusing(f"{path}: is no bag that can be read ({{why}}); expected {_EXPECTED}; {_RECOVER}"):
+        reader = _Files(_storage(path))
     try:
         yield Bag(reader, path, strict)
     except (InputError, OSError):  # of writing: what reading raises is an InputError

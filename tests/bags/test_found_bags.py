@@ -3,6 +3,7 @@ The photos are a known wall; depth, focal lengths and colours that come out are 
 
 from __future__ import annotations
 
+import json
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 
 from perception.bags.depth import decode_depth
 from perception.bags.frames import FrameOptions, run_frames
+from perception.bags.poses import nearest_first
 from perception.bags.read import decode_image, encoded
 from perception.cli import main
 from perception.errors import InputError
@@ -407,3 +409,81 @@ def test_files_that_were_not_closed(tmp_path: Path) -> None:
     (tmp_path / "b" / "b.db3-wal").write_bytes(b"pages")
     with pytest.raises(InputError, match=r"b\.db3-wal: holds messages that are not in the database yet"):
         run_frames(tmp_path / "b", tmp_path / "out")
+
+
+@pytest.mark.parametrize("topic", [COLOR, "/arduino"])
+@pytest.mark.parametrize("definition", ["", "Definition of a message", "float32[] \u00b0C\n=\n"])
+def test_definitions_that_relays_and_serial_bridges_write(topic: str, definition: str, tmp_path: Path) -> None:
+    """A definition that is empty or none, of the photos or of what nobody reads, beside the right MD5 sum."""
+    bag = Recorder(tmp_path / "a.bag", "ros1")
+    kind = "sensor_msgs/msg/Image" if topic == COLOR else "arduino/msg/Degrees"
+    md5 = bag.store.generate_msgdef("sensor_msgs/msg/Image")[1]
+    bag.topics[topic] = bag.writer.add_connection(topic, kind, msgdef=definition, md5sum=md5)
+    for number in range(COUNT):
+        time = 5 * 10**9 + number * 10**8
+        bag.info("/cam/color/camera_info", time, SIZE, K, [0.0] * 5)
+        bag.transform("/tf", time, "map", "cam", np.eye(4))
+        bag.image(COLOR, time, photo(number))
+    if topic != COLOR:
+        bag.writer.write(bag.topics[topic], 10**9, b"\1")
+    bag.close()
+    facts, _ = run_frames(tmp_path / "a.bag", tmp_path / "out", ALL)
+    assert facts["chosen"] == facts["with_pose"] == COUNT
+
+
+def test_messages_of_mcap_that_are_not_of_ros_2(tmp_path: Path) -> None:
+    record(tmp_path / "a", "mcap")
+    file = tmp_path / "a.mcap"
+    file.write_bytes((tmp_path / "a" / "a.mcap").read_bytes().replace(b"ros2msg", b"ros1msg"))
+    with pytest.raises(InputError, match=r"'ros1msg'.*expected ROS 1's \.bag, or ROS 2 messages in \.db3 or \.mcap"):
+        run_frames(file, tmp_path / "out")
+
+
+@pytest.mark.parametrize("own", ["/r2", "/r1"])
+def test_a_camera_has_the_poses_of_its_own_robot(own: str, tmp_path: Path) -> None:
+    """Two robots with the same names of frames, each with tf below its namespace; they stand at y = 1 and y = 2."""
+    bag = Recorder(tmp_path / "a", "sqlite")
+    for number in range(COUNT):
+        time = 5 * 10**9 + number * 10**8
+        for place, robot in enumerate(("/r1", "/r2"), start=1):
+            pose = np.eye(4)
+            pose[1, 3] = place
+            bag.info(f"{robot}/cam/camera_info", time, SIZE, K, [0.0] * 5)
+            bag.image(f"{robot}/cam/image_raw", time, photo(number))
+            bag.transform(f"{robot}/tf", time, "odom", "base", pose)
+            bag.transform(f"{robot}/tf_static", time, "base", "cam", np.eye(4))
+    bag.close()
+    options = FrameOptions(topic=f"{own}/cam/image_raw", spacing=1e-3)
+    facts, _ = run_frames(tmp_path / "a", tmp_path / "out", options)
+    frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
+    assert {frame["transform_matrix"][1][3] for frame in frames} == {float(own[2:])} and len(frames) == COUNT
+    assert f"'base' by {own}/tf, not" in facts["poses_from"]
+
+
+def test_topics_of_the_cameras_robot_come_first() -> None:
+    topics = ["/odom", "/r1/odom", "/r2/wheel/odom", "/r2/odom", "/tf"]
+    expected = [["/r2/odom"], ["/r2/wheel/odom"], ["/odom", "/tf"], ["/r1/odom"]]
+    assert nearest_first(topics, "/r2/cam/image_raw") == expected
+
+
+@pytest.mark.parametrize("image", [MM.astype(np.float32), np.zeros((72, 96), np.float32)])
+def test_depth_that_measures_nothing_is_told(image: np.ndarray, tmp_path: Path) -> None:
+    """Floats in millimetres are kilometres by REP 118, beyond what 16 bits of millimetres hold."""
+    record(tmp_path / "a", depth=lambda bag, n, t: bag.image(DEPTH, t, image, "cam", "32FC1"))
+    facts, _ = run_frames(tmp_path / "a", tmp_path / "out", ALL)
+    assert "measures nothing within 65.5 m; expected metres as floats" in facts["depth"] and not facts["with_depth"]
+    assert not (tmp_path / "out" / "depth").exists()
+
+
+def test_transforms_without_a_stamp_have_the_time_of_recording(tmp_path: Path) -> None:
+    bag = Recorder(tmp_path / "a", "sqlite")
+    bag.header = lambda time, frame, header=bag.header: header(0, frame)
+    for number in range(COUNT):
+        time = 5 * 10**9 + number * 10**8
+        bag.info("/cam/camera_info", time, SIZE, K, [0.0] * 5)
+        bag.image("/cam/image_raw", time, photo(number))
+        bag.transform("/tf", time, "map", "cam", np.block([[np.eye(3), np.full((3, 1), number)], [0, 0, 0, 1]]))
+    bag.close()
+    run_frames(tmp_path / "a", tmp_path / "out", ALL)
+    frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
+    assert [frame["transform_matrix"][0][3] for frame in frames] == list(range(COUNT))
