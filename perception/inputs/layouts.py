@@ -1,4 +1,5 @@
-"""Folders of RGB-D data sets: TUM RGB-D, ScanNet, 7-Scenes, 3DMatch, and Redwood / Open3D, recognised by content.
+"""Folders of RGB-D data sets, recognised by content: TUM RGB-D, ScanNet, 7-Scenes, 3DMatch, BundleFusion and 3RScan,
+Redwood / Open3D.
 
 All write pixel centres at whole numbers, so 0.5 is added to their principal points.
 """
@@ -36,10 +37,20 @@ _KINECT_DEPTH, _KINECT_COLOR = (585.0, 585.0, 320.0, 240.0), (525.0, 525.0, 320.
 _SIZE = (640, 480)
 _COMMA = re.compile(r"[+-]?\d+,\d+(e[+-]?\d+)?", re.IGNORECASE)
 _TEXTS = (
-    *("rgb.txt", "depth.txt", "groundtruth.txt", "pose/*.txt", "intrinsic/*.txt", "frame-*.pose.txt"),
-    *("seq*/frame-*.pose.txt", "camera-intrinsics.txt", "*.log", "*intrinsic*.json", "camera*.json"),
+    *(
+        "rgb.txt",
+        "depth.txt",
+        "groundtruth.txt",
+        "pose/*.txt",
+        "intrinsic/*.txt",
+        "intrinsics_*.txt",
+        "frame-*.pose.txt",
+    ),
+    *("seq*/frame-*.pose.txt", "camera-intrinsics.txt", "*info.txt", "*.log", "*intrinsic*.json", "camera*.json"),
 )
 _COLOR_FOLDERS = ("color", "image", "rgb")
+_SENSOR = ("_info.txt", "info.txt")
+"""Names of the files in which ScanNet's SensReader and its kin describe the cameras."""
 
 
 def open_recording(source: Path) -> Recording:
@@ -64,9 +75,10 @@ def layout_of(source: Path) -> Callable[[Path], Recording] | None:
 
 
 def text_files(source: Path) -> list[Path]:
-    """The files with poses, cameras and lists of photos in folder `source`, or of 3DMatch above it."""
+    """The files with poses, cameras and lists of photos in folder `source`, or cameras above it."""
     found = [file for pattern in _TEXTS for file in source.glob(pattern)]
-    return [file for file in [*found, source.parent / "camera-intrinsics.txt"] if file.is_file()]
+    above = (source.parent / name for name in ("camera-intrinsics.txt", *_SENSOR))
+    return [file for file in [*found, *above] if file.is_file()]
 
 
 def _color_folder(source: Path) -> Path | None:
@@ -148,17 +160,25 @@ def _scannet(source: Path) -> Recording:
     photos = _images(source / "color")
     frames = _posed(source, photos, lambda photo, kind: source / kind / photo.stem)
     depths = [frame.depth for frame in frames if frame.depth is not None]
-    own = _matrix_lens(source / "intrinsic/intrinsic_depth.txt", _first_size(depths)) if depths else None
+    files = {kind: source / f"intrinsic/intrinsic_{kind}.txt" for kind in ("color", "depth")}
+    if not files["color"].is_file():  # ScanNet's own choice of 25,000 frames
+        files = {kind: source / f"intrinsics_{kind}.txt" for kind in files}
+    own = _matrix_lens(files["depth"], _first_size(depths)) if depths else None
     notes = _missing(len(photos) - len(frames), len(photos), "a pose (tracking was lost)")
-    lens = _tried(_matrix_lens, source / "intrinsic/intrinsic_color.txt", _first_size(photos))
+    lens = _tried(_matrix_lens, files["color"], _first_size(photos))
     return Recording(source, "ScanNet", frames, lens, 1000.0, own, notes)
 
 
 def _seven_scenes(source: Path) -> Recording:
-    """frame-*.color.png, .depth.png in mm and .pose.txt, in the folder or in seq-*; 3DMatch adds the intrinsics."""
+    """frame-*.color.png, .depth.png in mm and .pose.txt, in the folder or in seq-*; 3DMatch adds the intrinsics, and
+    BundleFusion, 3RScan and 12 Scenes what `_sensor` reads."""
     photos = sorted(source.glob("frame-*.color.*")) or sorted(source.glob("seq*/frame-*.color.*"))
     frames = _posed(source, photos, lambda photo, kind: photo.with_name(f"{photo.name.partition('.')[0]}.{kind}"))
     notes = _missing(len(photos) - len(frames), len(photos), "a pose")
+    for file in (folder / name for folder in (source, source.parent) for name in _SENSOR):
+        if file.is_file():
+            color, own, metre = _sensor(file)
+            return Recording(source, "BundleFusion / 3RScan", frames, color, metre, own, notes)
     for folder in (source, source.parent):
         lens = _tried(_matrix_lens, folder / "camera-intrinsics.txt", _first_size(photos))
         if lens is not None:
@@ -174,13 +194,27 @@ def _seven_scenes(source: Path) -> Recording:
     return Recording(source, "7-Scenes", frames, color, 1000.0, depth_lens, notes, [warning])
 
 
+def _sensor(file: Path) -> tuple[Lens, Lens, float]:
+    """The lenses of photos and depth, and units of depth per metre, of lines "m_name = numbers"."""
+    with refusing(
+        f"{file}: expected lines 'm_calibrationColorIntrinsic = fx 0 cx 0 0 fy cy …' and their like ({{why}})"
+    ):
+        values = {row[0]: row[2:] for row in _rows(file) if row[1:2] == ["="]}
+        lenses = []
+        for kind in ("Color", "Depth"):
+            fx, _, cx, _, _, fy, cy = map(float, values[f"m_calibration{kind}Intrinsic"][:7])
+            width, height = (int(values[f"m_{kind.lower()}{side}"][0]) for side in ("Width", "Height"))
+            lenses.append(_lens((fx, fy, cx, cy), (width, height)))
+        return lenses[0], lenses[1], float(values["m_depthShift"][0])
+
+
 def _posed(source: Path, photos: list[Path], beside: Callable[[Path, str], Path]) -> list[Frame]:
     """The photos with a pose, a file of world_from_camera that is neither infinite nor all zero (tracking was lost).
-    beside: the photo's file of kind "depth" (.png) or "pose" (.txt), without suffix."""
+    beside: the photo's file of kind "depth" (.png or .pgm) or "pose" (.txt), without suffix."""
     frames, files = [], NamedFiles(source)
     for photo in photos:
-        stems = (beside(photo, kind).relative_to(source) for kind in ("depth", "pose"))
-        depth, pose = (files.find(f"{stem}{end}") for stem, end in zip(stems, (".png", ".txt"), strict=True))
+        stems = (str(beside(photo, kind).relative_to(source)) for kind in ("depth", "pose"))
+        depth, pose = (files.find(s, ends) for s, ends in zip(stems, ((".png", ".pgm"), (".txt",)), strict=True))
         matrix = _numbers(pose, 4) if pose is not None else np.zeros((4, 4))
         if matrix.shape != (4, 4):
             raise InputError(f"{pose}: {len(matrix)} rows, expected a 4×4 matrix world_from_camera")
@@ -242,7 +276,7 @@ def _numbers(file: Path, columns: int) -> np.ndarray:
     """[N, at least `columns`] float64."""
     rows = _rows(file)
     with refusing(f"{file}: expected lines of {columns} numbers ({{why}})"):
-        table = np.array(rows, np.float64)
+        table = np.array([["nan" if "1.#" in field else field for field in row] for row in rows], np.float64)
         if table.shape[1] < columns:
             raise ValueError(f"found {table.shape[1]}")
     return table

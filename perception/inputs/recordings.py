@@ -128,22 +128,32 @@ def choose_frames(
 
 
 def median_depth(recording: Recording) -> float:
-    """Median in metres over some depth images of the recording. InputError when nothing or nonsense was measured."""
+    """Median in metres over some depth images of the recording that can be read. InputError when none can, and when
+    nothing or nonsense was measured."""
     paths = [frame.depth for frame in recording.frames if frame.depth is not None]
     if not paths:
         raise InputError(f"{recording.source}: a recording as of {recording.kind}, but no photo has a depth image")
     some = [paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, LOOKED_AT).round().astype(int))]
-    measured = [depth[depth > 0] for depth in map(read_depth, some)]
-    found = [float(np.median(values)) / recording.metre for values in measured if values.size]
+    found, damaged = list[float](), list[InputError]()
+    for path in some:
+        try:
+            depth = read_depth(path)
+        except InputError as error:
+            damaged.append(error)
+            continue
+        if (depth > 0).any():
+            found.append(float(np.median(depth[depth > 0])) / recording.metre)
+    if len(damaged) == len(some):
+        raise damaged[0]
     if not found:
         raise InputError(f"{some[0]}: this and {len(some) - 1} other depth images hold nothing measured")
-    depth = float(np.median(found))
-    if not NEAREST <= depth <= FARTHEST:
+    typical = float(np.median(found))
+    if not NEAREST <= typical <= FARTHEST:
         raise InputError(
-            f"{some[0]}: the median depth is {depth:.3g} m if {recording.metre:g} stored units are a metre, as for "
+            f"{some[0]}: the median depth is {typical:.3g} m if {recording.metre:g} stored units are a metre, as for "
             f"{recording.kind}; expected {NEAREST:g} to {FARTHEST:g} m"
         )
-    return depth
+    return typical
 
 
 def _view(recording: Recording, frame: Frame, lens: Lens, masks: Path | None) -> View:

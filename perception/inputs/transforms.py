@@ -284,7 +284,7 @@ def _depth(file: Path, frame: dict[str, Any], listing: _Listing) -> DepthImage |
     scale = next((scale for scale in scales if scale is not None), MILLIMETRE)
     if scale <= 0:
         raise InputError(f"{what}: the scale of its depth must be above 0, found {scale:g}")
-    return DepthImage(listing.needed(file, "depth image", listed), scale)
+    return DepthImage(listing.find(str(listed)) or file.parent / str(listed), scale)
 
 
 def _gravity(file: Path, data: dict[str, Any]) -> dict[str, Any]:

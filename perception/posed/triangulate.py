@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from perception.errors import InputError
 from perception.geometry import inverse_se3
+from perception.photos.depth import load_depth
 from perception.photos.lens import camera_from_lens, lens_text, load_pycolmap
 from perception.photos.still import with_still
 from perception.photos.views import view_lens
@@ -29,7 +31,9 @@ def posed_scene(views: list[View], cloud: Cloud, facts: dict[str, Any], options:
     """The Scene of views with known poses. cloud: points [P, 3] and colors [P, 3] from the input.
     With fewer than `least` points, triangulated points are used instead. facts: report entries, with "warnings"."""
     cameras = sorted({lens_text(view_lens(view)) for view in views})
+    views, unread = _without_damaged_depth(views, options.strict)
     report = {**facts, "registered": len(views), "cameras": cameras, "seconds": {}}
+    report["warnings"] = [*report["warnings"], *unread]
     photos, sizes, own = map(list, zip(*((view.photo, view.photo_size, view.mask) for view in views), strict=True))
     as_stored = [view.as_stored for view in views]
     still = with_still(photos, sizes, own, options.still_folder(own), options.progress, as_stored)
@@ -57,6 +61,22 @@ def posed_scene(views: list[View], cloud: Cloud, facts: dict[str, Any], options:
             report |= {**found, "warnings": [*report["warnings"], *found["warnings"]]}
     report["points"] = len(points)
     return Scene(views, points, colors, report=report)
+
+
+def _without_damaged_depth(views: list[View], strict: bool) -> tuple[list[View], list[str]]:
+    """The views without depth images that cannot be read or do not fit their cameras, and a warning for them.
+    InputError where that is all of them, or strict."""
+    kept, damaged = list[View](), list[InputError]()
+    for view in views:
+        try:
+            load_depth(view, 2, 2)
+        except InputError as error:
+            damaged.append(error)
+            view = replace(view, depth=None)
+        kept.append(view)
+    if damaged and (strict or not any(view.depth for view in kept)):
+        raise damaged[0]
+    return kept, [f"{len(damaged)} depth images are not used, such as {damaged[0]}"] if damaged else []
 
 
 def triangulated_cloud(

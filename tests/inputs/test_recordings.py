@@ -167,6 +167,7 @@ BAD = [
     ("7scenes", lambda s: _depth(s, 0), "hold nothing measured"),
     ("7scenes", lambda s: _depth(s, 65535), "hold nothing measured"),
     ("7scenes", lambda s: _depth(s, 2), "median depth is 0.002 m if 1000 stored units"),
+    ("3rscan", lambda s: _edit(s / "_info.txt", "m_depthShift", "m_shift"), "_info.txt: expected lines 'm_calibration"),
     ("redwood", lambda s: (s / "depth/000001.png").unlink(), "12 photos in image/, 11 images in depth/"),
     ("redwood", lambda s: (s / "wall.log").write_text("0 0 1\n1 0 0 0"), "blocks of a line"),
     ("redwood", lambda s: _edit(s / "wall.log", "11 11 12\n", "11 11 12\n9 "), "blocks of a line"),
@@ -303,3 +304,52 @@ def test_phone_depth_of_another_size_and_lenses_per_frame(tmp_path: Path) -> Non
         assert (
             np.abs(found - true) < 2 * np.abs(np.gradient(true, axis=1)) + 1e-3
         ).all()  # depth pixels are 3 times larger
+
+
+def test_a_pose_that_was_lost_as_older_visual_c_writes_it(tmp_path: Path) -> None:
+    source = write_recording(tmp_path, "3rscan")
+    lost = " ".join(["-1.#INF"] * 3 + ["-1.#IND"])
+    (source / "frame-000003.pose.txt").write_text("\n".join([lost] * 4))
+    assert [number(frame.name, "3rscan") for frame in open_recording(source).frames] == [
+        i for i in range(COUNT) if i != 3
+    ]
+
+
+def test_scannets_choice_of_frames_has_its_intrinsics_beside_the_folders(tmp_path: Path) -> None:
+    source = write_recording(tmp_path, "scannet")
+    before = open_recording(source)
+    for kind in ("color", "depth"):
+        (source / f"intrinsic/intrinsic_{kind}.txt").rename(source / f"intrinsics_{kind}.txt")
+    after = open_recording(source)
+    assert (after.lens, after.depth_lens) == (before.lens, before.depth_lens) and after.lens is not None
+
+
+@pytest.mark.parametrize("damage", ["cut", "cropped", "8 bits", "missing"])
+def test_one_damaged_depth_image_is_not_used_and_named(damage: str, tmp_path: Path) -> None:
+    source = write_recording(tmp_path, "redwood")
+    scene = loaded(source, tmp_path)
+    names = [view.name for view in scene.views]
+    assert scene.views[1].depth is not None
+    file = scene.views[1].depth.path
+    image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    if damage == "cut":
+        file.write_bytes(file.read_bytes()[:200])
+    elif damage == "missing":
+        poses = {view.name: (np.linalg.inv(view.camera_from_world) @ np.diag([1, -1, -1, 1])) for view in scene.views}
+        frames = [
+            {"file_path": n, "depth_file_path": n.replace("image", "depth"), "transform_matrix": m.tolist()}
+            for n, m in poses.items()
+        ]
+        K = dict(zip(("fl_x", "fl_y", "cx", "cy"), (140.0, 141.0, 79.5, 61.0), strict=True))
+        (source / "transforms.json").write_text(json.dumps({**K, "frames": frames}))
+        (source / "wall.log").unlink()
+        file.unlink()
+    else:
+        cv2.imwrite(str(file), image[:, 40:] if damage == "cropped" else (image // 256).astype(np.uint8))
+    (tmp_path / "again").mkdir()
+    scene = loaded(source, tmp_path / "again")
+    assert [view.name.split("/")[-1] for view in scene.views] == [name.split("/")[-1] for name in names]
+    assert [view.depth is None for view in scene.views] == [i == 1 for i in range(len(names))]
+    assert any(f"1 depth images are not used, such as {file}: " in each for each in scene.report["warnings"])
+    with pytest.raises(InputError, match=str(file)):
+        load_scene(source, ReadOptions(tmp_path / "strict", strict=True))

@@ -15,13 +15,14 @@ from scipy.spatial.transform import Rotation
 
 COUNT, STEP, TURN, SLOPE = 12, 0.05, 0.04, 0.3
 SIZE = (160, 120)
-_UNITS = {"tum": 5000}  # per metre
+_UNITS = {"tum": 5000, "3rscan": 2000}  # per metre
 NAMED = {  # (fx, fy, cx, cy) of photos of SIZE, pixel centres at whole numbers, and the same of depth
     "tum": ((133.85, 134.8, 79.65, 61.525), None),  # freiburg3, 640 × 480, at a quarter
     "scannet": ((140.0, 141.0, 79.0, 60.5), (120.0, 119.0, 78.5, 58.0)),
     "7scenes": ((131.25, 131.25, 79.625, 59.625), (146.25, 146.25, 79.625, 59.625)),  # 525 and 585 at a quarter
     "3dmatch": ((140.0, 141.0, 79.0, 60.5), None),
     "redwood": ((140.0, 141.0, 79.0, 60.5), None),
+    "3rscan": ((140.0, 141.0, 79.0, 60.5), (120.0, 119.0, 78.5, 58.0)),
 }
 
 
@@ -70,9 +71,8 @@ def _frames_of(layout: str) -> list[tuple[np.ndarray, np.ndarray]]:
 def write_recording(folder: Path, layout: str) -> Path:
     """Writes the recording of COUNT frames; returns the folder to map."""
     source = folder / ("rgbd_dataset_freiburg3_wall" if layout == "tum" else layout)
-    {"tum": _tum, "scannet": _scannet, "7scenes": _frames, "3dmatch": _frames, "redwood": _redwood}[layout](
-        source, _frames_of(layout)
-    )
+    write = {"tum": _tum, "scannet": _scannet, "redwood": _redwood, "3rscan": _sensor}.get(layout, _frames)
+    write(source, _frames_of(layout))
     if layout == "3dmatch":
         np.savetxt(source / "camera-intrinsics.txt", matrix(NAMED[layout][0], 0.0))
     return source
@@ -123,6 +123,24 @@ def _frames(source: Path, frames: list[tuple[np.ndarray, np.ndarray]]) -> None:
         _save(stem.with_suffix(".color.png"), photo)
         _save(stem.with_suffix(".depth.png"), depth)
         np.savetxt(stem.with_suffix(".pose.txt"), pose(index))
+
+
+def _sensor(source: Path, frames: list[tuple[np.ndarray, np.ndarray]]) -> None:
+    _frames(source, frames)
+    for file in (source / "seq-01").iterdir():
+        depth = file.name.endswith(".depth.png")
+        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) if depth else None
+        file = file.rename(source / file.name)
+        if image is not None:
+            cv2.imwrite(str(file.with_suffix(".pgm")), image)
+            file.unlink()
+    lines = ["m_versionNumber = 4", "m_sensorName = Tango", f"m_depthShift = {_UNITS['3rscan']}"]
+    for name, lens in zip(("Color", "Depth"), NAMED["3rscan"], strict=True):
+        K = np.eye(4)
+        K[:3, :3] = matrix(lens, 0.0)  # type: ignore[arg-type]
+        lines += [f"m_{name.lower()}{side} = {n}" for side, n in zip(("Width", "Height"), SIZE, strict=True)]
+        lines.append(f"m_calibration{name}Intrinsic = " + " ".join(f"{value:g}" for value in K.ravel()))
+    (source / "_info.txt").write_text("\n".join(lines) + "\n")
 
 
 def _redwood(source: Path, frames: list[tuple[np.ndarray, np.ndarray]]) -> None:
