@@ -17,6 +17,8 @@ from perception.geometry import interpolated_pose, inverse_se3, transform
 FIXED_FRAMES = ("map", "odom", "world")
 MAX_GAP = 0.5
 """Maximum time in seconds between two samples of a moving frame for a pose to be interpolated."""
+SET_BACK = 1_000_000_000
+"""Least time in ns by which stamps fall when a clock is set back, or a recording is played again."""
 G = 9.81
 STILL_TURN, STILL_PUSH = 0.5, 0.5
 """Largest rate of turn in rad/s and largest difference of the measured acceleration from G in m/s² of used samples."""
@@ -37,6 +39,7 @@ class Poses:
         self._static = set[str]()
         self.topics = dict[str, list[str]]()
         self._arrays = dict[str, tuple[np.ndarray, np.ndarray]]()
+        self._twice = dict[str, np.ndarray]()  # of each child, the spans [S, 2] of stamps that came twice
 
     def add(self, parent: str, child: str, time: int, parent_from_child: np.ndarray, static: bool = False) -> None:
         """Adds one sample [4, 4] at a time in ns. A frame keeps its first parent."""
@@ -57,9 +60,12 @@ class Poses:
         return found
 
     def told(self, frame: str) -> str | None:
-        """Of which topics the poses above `frame` are, where there are several; None where there are not."""
+        """Of which topics the poses above `frame` are, where there are several, and whose clock was set back before
+        they were asked for; None where there is nothing to tell."""
         several = {child: found for child in self.path(frame) if len(found := self.topics.get(child, [])) > 1}
         lines = [f"'{child}' by {found[0]}, not {', '.join(found[1:])}" for child, found in several.items()]
+        back = [child for child in self.path(frame) if len(self._twice.get(child, ()))]
+        lines += [f"none at stamps of '{child}' that came twice: its clock was set back" for child in back]
         return "; ".join(lines) or None
 
     def camera_from_world(self, fixed: str, frame: str, time: int) -> np.ndarray | None:
@@ -86,12 +92,18 @@ class Poses:
     def _at(self, child: str, time: int) -> np.ndarray | None:
         if child not in self._arrays:
             stamps, rows = (np.array(column) for column in self._samples.pop(child))
+            latest = np.maximum.accumulate(stamps)
+            back = (stamps < latest - SET_BACK) & (child not in self._static)
+            first = np.flatnonzero(back & ~np.r_[False, back[:-1]])
+            self._twice[child] = np.stack([stamps[first], latest[first]], axis=1)
             poses, order = np.tile(np.eye(4), (len(stamps), 1, 1)), np.argsort(stamps, kind="stable")
             poses[:, :3] = rows.reshape(-1, 3, 4)[order]
             self._arrays[child] = stamps[order], poses
         times, matrices = self._arrays[child]
         if child in self._static:
             return np.asarray(matrices[-1])
+        if ((self._twice[child][:, 0] <= time) & (time <= self._twice[child][:, 1])).any():
+            return None
         return interpolated_pose(times, matrices, time, MAX_GAP * 1e9)
 
 

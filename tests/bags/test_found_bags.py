@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -487,3 +488,24 @@ def test_transforms_without_a_stamp_have_the_time_of_recording(tmp_path: Path) -
     run_frames(tmp_path / "a", tmp_path / "out", ALL)
     frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
     assert [frame["transform_matrix"][0][3] for frame in frames] == list(range(COUNT))
+
+
+def test_photos_have_no_pose_while_a_clock_that_was_set_back_tells_times_twice(tmp_path: Path) -> None:
+    """At 10 s it is set back by 3 s: what has a stamp of 7 s to 10 s may be of before or of after. The recorder's own
+    clock goes on, as where a recording that is played again is recorded."""
+    bag = Recorder(tmp_path / "a", "sqlite")
+    recorded, write = count(10**12), bag.writer.write
+    bag.writer.write = lambda connection, time, data: write(connection, next(recorded), data)
+    for number in range(160):
+        time = 5 * 10**9 + number * 10**8 - (3 * 10**9 if number > 50 else 0)
+        pose = np.block([[np.eye(3), np.full((3, 1), number)], [0, 0, 0, 1]])
+        bag.transform("/tf", time, "map", "cam", pose)
+        if number % 20 == 10:  # at 6, 8 and 10 s, and again at 9 s, 11 s, …
+            bag.info("/cam/camera_info", time, SIZE, K, [0.0] * 5)
+            bag.image("/cam/image_raw", time, photo(number))
+    bag.close()
+    facts, text = run_frames(tmp_path / "a", tmp_path / "out", ALL)
+    frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
+    found = {frame["stamp_ns"] // 10**9: frame["transform_matrix"][0][3] for frame in frames}
+    assert found == {6: 10, 11: 90, 13: 110, 15: 130, 17: 150} and facts["chosen"] == 8
+    assert "poses: none at stamps of 'cam' that came twice: its clock was set back" in text
