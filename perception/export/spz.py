@@ -36,7 +36,9 @@ def write_spz(path: Path, gmap: Map) -> None:
 def spz_bytes(gmap: Map, path: Path = Path("map.spz")) -> bytes:
     """The file's bytes. InputError naming `path` where a value is not finite, or a mean beyond what 24 bits hold."""
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
-        if not np.isfinite(getattr(gmap, name)).all():
+        values = getattr(gmap, name)
+        wrong = np.isnan(values) if name in ("log_scales", "opacity_logits") else ~np.isfinite(values)
+        if wrong.any():  # an infinite logit is an opacity of 0 or 1, and a logarithm of -∞ a size of 0
             raise InputError(f"{path}: {name} of some Gaussians are not finite; upgrade or rebuild the map")
     count, degree = len(gmap), math.isqrt(gmap.sh.shape[1]) - 1
     means = gmap.means.astype(np.float64) * [1, -1, -1]

@@ -42,7 +42,8 @@ def read_cloud(path: str | Path) -> PointCloud:
     is at most three times the size of the file (`python tools speed.readers`)."""
     path, kind = Path(path), Path(path).suffix.lower()
     if kind not in _FORMATS:
-        raise InputError(f"{path}: unknown point cloud format '{path.suffix}'; expected {', '.join(_FORMATS)}")
+        found = f"unknown point cloud format '{path.suffix}'; expected {', '.join(_FORMATS)}"
+        raise InputError(f"{path}: {found}; convert it, for example with CloudCompare or `pdal translate`")
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; expected a point cloud")
     require_memory(3 * path.stat().st_size, str(path), "split the cloud, or use a machine with more memory")

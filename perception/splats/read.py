@@ -3,9 +3,10 @@
 property            usual meaning                        variants that are read
 x y z               mean                                 float64
 f_dc_*, f_rest_*    harmonics of degree 0 to 4           none of degree 1 and more; red green blue, 0 to 255
-opacity             logit                                the opacity itself, in [0, 1]
+opacity             logit                                the opacity itself, in [0, 1], or in [-1, 1] by its size
 scale_*             logarithm of the σ along each axis   σ itself; two of them (a disc, as of 2DGS)
 rot_*               quaternion wxyz of any length        none: no rotation
+filter_3D           none                                 Mip-Splatting's smoothing σ, with which Gaussians are drawn
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from perception.colors import sh_from_rgb
 from perception.errors import InputError
@@ -25,8 +27,13 @@ from perception.splats.spz import read_spz
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
 LEAST_ROWS = 64
 """Gaussians that a scene needs: fewer are one blob, or nothing that instances could be found in."""
-LINEAR_SHARE = 0.05
-"""Median of exp(scale), relative to the extent of the scene, above which positive scales are no logarithms."""
+LINEAR_SHARE, LINEAR_SPACING, SOME = 0.05, 10.0, 2000
+"""Median of exp(scale), relative to the extent of the scene, and to the median distance of SOME to the next Gaussian,
+above which positive scales are no logarithms."""
+LEAST_LOG = 1.0
+"""Median below which they are none either: of Gaussians that are all larger than 1, half would be smaller than e."""
+ABOVE = 1e-3
+"""How much larger than 1 opacities may be rounded."""
 FLAT = 1e-3
 """Thickness of a disc relative to its smaller σ."""
 PARKED = -80.0
@@ -143,6 +150,9 @@ def _plain(path: Path, rows: Mapping[str, np.ndarray]) -> Splat:
         quats = table([f"rot_{i}" for i in range(4)])
     notes += [] if turned else ["Gaussians have no rotation: there is no rot_0 to rot_3"]
     scales, opacity = _decoded(means, scales, opacity, notes)
+    if "filter_3D" in rows:
+        scales, opacity = _filtered(scales, opacity, rows["filter_3D"])
+        notes.append("scales and opacities are those with Mip-Splatting's filter_3D, as it draws them")
     if (good := np.isfinite(means).all(axis=1) & ~np.isnan(scales).any(axis=1)).any():
         rounded = max(float(np.median(np.abs(rows[a][good] - means[good, i]))) for i, a in enumerate("xyz"))
         if rounded > ROUNDED * (sigma := float(np.exp(np.median(scales[good])))):
@@ -158,19 +168,40 @@ def _decoded(
     good = np.isfinite(means).all(axis=1) & ~np.isnan(scales).any(axis=1) & ~np.isnan(opacity)
     if not good.any():
         return scales, opacity
-    low, high = np.percentile(means[good], [5, 95], axis=0)
-    large = bool(np.exp(np.median(scales[good])) > LINEAR_SHARE * max(float((high - low).max()), 1e-12))
-    if scales[good].min() > 0 and large:
+    middle = float(np.median(scales[good]))
+    if scales[good].min() > 0 and (middle < LEAST_LOG or np.exp(middle) > _largest(means[good])):
         scales = np.log(scales)
         notes.append("scales are lengths, not their logarithms, as all are positive; the map holds logarithms")
-    if opacity[good].min() >= 0 and opacity[good].max() <= 1:
-        clipped = np.clip(opacity.astype(np.float64), 1e-6, 1 - 1e-6)
+    if (sizes := np.abs(opacity[good].astype(np.float64))).max() <= 1 + ABOVE:
+        signed = ", by their absolute values" if opacity[good].min() < 0 else ""
+        clipped = np.full(len(opacity), np.nan)
+        clipped[good] = np.clip(sizes, 1e-6, 1 - 1e-6)
         opacity = np.log(clipped / (1 - clipped)).astype(np.float32)
-        notes.append("opacities are in [0, 1], not logits; the map holds logits")
+        notes.append(f"opacities are in [0, 1]{signed}, not logits; the map holds logits")
     if scales.shape[1] == 2:
         scales = np.column_stack([scales, scales.min(axis=1) + np.float32(np.log(FLAT))])
         notes.append("Gaussians are discs: there is no scale_2")
     return scales, opacity
+
+
+def _largest(means: np.ndarray) -> float:
+    """The largest σ that is likely in the median, of Gaussians with means [N, 3]."""
+    low, high = np.percentile(means, [5, 95], axis=0)
+    some = means[:: -(-len(means) // SOME)]
+    apart = cKDTree(means).query(some, k=2)[0][:, 1]
+    spacing = float(np.median(apart[apart > 0])) if (apart > 0).any() else np.inf
+    return min(LINEAR_SHARE * max(float((high - low).max()), 1e-12), LINEAR_SPACING * spacing)
+
+
+def _filtered(scales: np.ndarray, opacity: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Log-scales [N, 3] and opacity logits [N] with Mip-Splatting's 3D smoothing filter σ_f [N] (Yu et al. 2024,
+    equation 9): covariances grow by σ_f², and opacities shrink by √(|Σ| / |Σ + σ_f² I|)."""
+    with np.errstate(all="ignore"):  # rows that are no numbers are parked
+        variances = np.exp(2 * scales.astype(np.float64))
+        wider = variances + sigma.astype(np.float64)[:, None] ** 2
+        share = np.sqrt((variances / wider).prod(axis=1)) / (1 + np.exp(-opacity.astype(np.float64)))
+        share = np.clip(share, 1e-6, 1 - 1e-6)
+        return (np.log(wider) / 2).astype(np.float32), np.log(share / (1 - share)).astype(np.float32)
 
 
 def _compressed(rows: Mapping[str, np.ndarray]) -> Splat:

@@ -95,3 +95,12 @@ def test_a_value_that_no_bits_hold_is_told(tmp_path: Path) -> None:
     gmap.means[3] = np.nan
     with pytest.raises(InputError, match="means of some Gaussians are not finite"):
         spz_bytes(gmap)
+
+
+def test_opacities_of_1_and_flat_gaussians_are_written() -> None:
+    """Their logits and logarithms are infinite, as trainers and converters leave them."""
+    gmap = a_map()
+    gmap.opacity_logits[:2] = np.inf, -np.inf
+    gmap.log_scales[0, 2] = -np.inf
+    found = read_spz(spz_bytes(gmap))
+    assert found["opacities"][:2].tolist() == [1, 0] and found["log_scales"][0, 2] == -10

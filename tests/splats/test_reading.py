@@ -85,6 +85,42 @@ def test_values_that_are_activated_already(tmp_path: Path) -> None:
     assert len(splat.notes) == 2
 
 
+@pytest.mark.parametrize("unit", [1.0, 20.0, 1000.0])
+def test_lengths_are_no_logarithms_however_large_the_scene(unit: float, tmp_path: Path) -> None:
+    """A scene of the same density that is 1 to 1000 units wide: in metres, wider, and in millimetres."""
+    lengths = {f"scale_{i}": (lambda v, i=i: unit * np.exp(v[f"scale_{i}"])) for i in range(3)}
+    wide = {name: (lambda v, n=name: v[n] * unit) for name in "xyz"}
+    splat = read_splat(write(tmp_path / "a.ply", changed(**lengths, **wide)))
+    assert np.allclose(splat.log_scales[:, 1], columns(0)["scale_1"] + np.log(unit), atol=1e-5)
+    sparse = changed(
+        **{f"scale_{i}": (lambda v, i=i: np.exp(v[f"scale_{i}"])) for i in range(3)}, x=lambda v: 1e4 * v["x"]
+    )
+    assert np.allclose(read_splat(write(tmp_path / "b.ply", sparse)).log_scales[:, 1], columns(0)["scale_1"], atol=1e-5)
+
+
+def test_opacities_by_their_absolute_values_and_rounded_above_1(tmp_path: Path) -> None:
+    """Taming 3DGS draws |opacity|."""
+    share = 1 / (1 + np.exp(-columns(0)["opacity"]))
+    signed = np.where(np.arange(COUNT) % 2, share, -share)
+    signed[0] = 1.0004
+    splat = read_splat(write(tmp_path / "a.ply", changed(opacity=lambda v: signed)))
+    assert np.allclose(1 / (1 + np.exp(-splat.opacity_logits[1:])), share[1:], atol=1e-5)
+    assert splat.opacity_logits[0] > 10 and "by their absolute values" in splat.notes[0]
+
+
+def test_the_filter_of_mip_splatting_is_part_of_what_is_drawn(tmp_path: Path) -> None:
+    """A 3D Gaussian of covariance S convolved with one of σ² I keeps its integral, opacity √|S|, and has S + σ² I."""
+    plain = columns(0)
+    sigma = np.linspace(0.001, 0.05, COUNT)
+    splat = read_splat(write(tmp_path / "a.ply", changed(filter_3D=lambda v: sigma)))
+    sizes = np.exp(np.stack([plain[f"scale_{i}"] for i in range(3)], axis=1))
+    wider = np.sqrt(sizes**2 + sigma[:, None] ** 2)
+    assert np.allclose(np.exp(splat.log_scales), wider, rtol=1e-5)
+    opacity, old = (1 / (1 + np.exp(-values.astype(np.float64))) for values in (splat.opacity_logits, plain["opacity"]))
+    assert np.allclose(opacity * wider.prod(axis=1), old * sizes.prod(axis=1), rtol=1e-4)
+    assert "filter_3D" in splat.notes[0]
+
+
 def test_large_units_do_not_make_logarithms_lengths(tmp_path: Path) -> None:
     """A scene in millimetres has positive logarithms."""
     values = changed(**{name: (lambda v, n=name: v[n] * 1000) for name in "xyz"})
