@@ -122,6 +122,9 @@ def left_out(path: Path, cloud: PointCloud) -> list[str]:
 def _cloud_of(element: Element, path: Path) -> PointCloud:
     """The cloud of the named columns [P] of a file at `path`; lists are left out."""
     columns = {name: values for name, values in element.items() if isinstance(values, np.ndarray) and values.ndim == 1}
+    for names in (("x", "y", "z"), *_COLORS, *_NORMALS):  # in capitals
+        if set(names) <= {name.lower() for name in columns} and not set(names) & columns.keys():
+            columns = {name.lower() if name.lower() in names else name: values for name, values in columns.items()}
     if not set("xyz") <= columns.keys():
         raise InputError(f"{path}: has the fields {', '.join(columns)[:200] or 'none'}; expected x, y and z")
     cloud = PointCloud(_floats(np.stack([columns[axis] for axis in "xyz"], axis=1)))
@@ -131,7 +134,7 @@ def _cloud_of(element: Element, path: Path) -> PointCloud:
     if colors is not None:
         cloud.colors = to_uint8(np.stack([columns[name] for name in colors], axis=1))
     elif together is not None:
-        bgra = np.ascontiguousarray(columns[together]).view(np.uint8).reshape(-1, 4)  # of 0xAARRGGBB
+        bgra = _packed_colors(columns[together]).view(np.uint8).reshape(-1, 4)  # of 0xAARRGGBB
         cloud.colors = np.ascontiguousarray(bgra[:, 2::-1])
     if normals is not None:
         cloud.normals = np.stack([columns[name] for name in normals], axis=1).astype(np.float32, copy=False)
@@ -140,6 +143,15 @@ def _cloud_of(element: Element, path: Path) -> PointCloud:
         free = short not in {*columns, *_WRITTEN}
         cloud.labels[short if free else name] = np.ascontiguousarray(columns[name])
     return cloud
+
+
+def _packed_colors(values: np.ndarray) -> np.ndarray:
+    """0xAARRGGBB [P] as numbers of 4 bytes. Floats hold their bits, and are below 1e-37 or beyond 1e37; whole numbers
+    between are the number itself, as texts of integers with TYPE F give it."""
+    whole = (values == np.floor(values)) & (values >= 0) & (values < 1 << 24)
+    if values.dtype.kind == "f" and whole.all():
+        values = values.astype(np.uint32)
+    return np.ascontiguousarray(values)
 
 
 def _floats(points: np.ndarray) -> np.ndarray:

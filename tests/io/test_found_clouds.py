@@ -322,3 +322,23 @@ def test_reading_takes_three_times_the_file(kind: str, tmp_path: Path) -> None:
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     assert float(run.stdout.partition(" times the file")[0].split()[-1]) <= 3, run.stdout
+
+
+def test_names_in_capitals(tmp_path: Path) -> None:
+    """As PDAL names colours beside x, and others all of them; one of three alone is a column."""
+    names, wide = ("X", "Y", "Z", "Red", "Green", "Blue", "Intensity", "B"), RGB.astype(np.float64) * 257
+    values = [*XYZ.T.astype(np.float64), *wide.T, np.arange(N) * 1.0, np.arange(N) * 1.0]
+    cloud = read_cloud(ply(tmp_path / "a.ply", dict(zip(names, values, strict=True))))
+    np.testing.assert_array_equal(cloud.points, XYZ)
+    np.testing.assert_array_equal(cloud.colors, RGB)
+    assert list(cloud.labels) == ["Intensity", "B"]
+
+
+@pytest.mark.parametrize("kind", ["F", "U"])
+def test_packed_colours_as_whole_numbers_in_a_text(kind: str, tmp_path: Path) -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (20, 3))
+    rgb[0] = 0
+    head = "FIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F " + kind + "\nWIDTH 20\nHEIGHT 1\nPOINTS 20\nDATA ascii\n"
+    rows = [f"0 0 {i} {(r << 16) | (g << 8) | b}" for i, (r, g, b) in enumerate(rgb.tolist())]
+    (tmp_path / "a.pcd").write_text(head + "\n".join(rows) + "\n")
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.pcd").colors, rgb)
