@@ -33,7 +33,8 @@ APART = 0.03
 MILLIMETRES, LARGEST = 1000.0, 65534
 """Stored units per metre, and the largest: 65535 means saturated to many programs."""
 _SAME_LENS = 0.01
-"""Largest relative difference between focal lengths for which depth in the photos' frame counts as registered."""
+"""Largest distance, relative to the sides of the picture, between the pixels in which two lenses see the same place for
+which depth in the photos' frame counts as registered."""
 _HEADER = struct.Struct("<iff")
 """Begins a message of compressedDepth: the format, a and b, of which 32FC1 stores v = a / depth + b as PNG."""
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -169,7 +170,11 @@ def write_depth(
 
 
 def _same(a: Lens, b: Lens) -> bool:
-    """Whether two lenses see the same, at any resolution."""
-    ratio = np.array([a.width / b.width, a.height / b.height] * 2)
-    size = np.array([a.width, a.height] * 2)
-    return bool((np.abs(np.array(a.params[:4]) - ratio * b.params[:4]) < _SAME_LENS * size).all())
+    """Whether two lenses see the same, at any resolution, with the same distortion."""
+    size = np.array([b.width, b.height])
+    pixels = np.stack(np.meshgrid(*[np.linspace(0.1, 0.9, 5)] * 2), axis=-1).reshape(-1, 2) * size
+    rays = np.asarray(camera_from_lens(b).cam_from_img(pixels)).reshape(-1, 2)
+    seen = np.asarray(
+        camera_from_lens(rescale_lens(a, b.width, b.height)).img_from_cam(np.c_[rays, np.ones(len(rays))])
+    )
+    return bool((np.abs(seen - pixels) < _SAME_LENS * size).all())

@@ -18,7 +18,7 @@ from perception.inputs.transforms import read_frames
 
 pytest.importorskip("rosbags")
 from support.bag_recorder import Recorder
-from support.rgbd_folders import SIZE, matrix, picture, pose, wall_depth
+from support.rgbd_folders import SIZE, SLOPE, matrix, picture, pose, wall_depth
 
 COLOR, OWN, FRAMES, START, STEP_NS = (
     matrix((140.0, 141.0, 79.0, 60.5)),
@@ -173,3 +173,25 @@ def test_depth_of_another_shape_than_its_camera_is_left_out(tmp_path: Path) -> N
     assert facts["with_depth"] == 0 and f"its camera_info says {SIZE[0]}x{SIZE[1]}" in text
     with pytest.raises(InputError, match="an image is"):
         run_frames(tmp_path / "drive", tmp_path / "named", FrameOptions(depth="/depth/image_raw"))
+
+
+def test_depth_without_the_photos_distortion_is_registered(tmp_path: Path) -> None:
+    """One frame and one matrix, but depth is rectified and photos are not: rays of pixels by OpenCV."""
+    bag, half = Recorder(tmp_path / "drive", "mcap"), np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    bend = [-0.35, 0.1, 0.0, 0.0, 0.0]
+    bag.info("/color/camera_info", START, SIZE, COLOR - half, bend)
+    bag.info("/depth/camera_info", START, SIZE, COLOR - half, [0.0] * 5)
+    depth, _ = wall_depth(COLOR, np.eye(4), *SIZE)
+    for index in range(3):
+        bag.image("/color/image_raw", START + index * STEP_NS, picture(wall_depth(COLOR, pose(index), *SIZE)[1]))
+        bag.image("/depth/image_raw", START + index * STEP_NS, depth.astype(np.float32), "cam", "32FC1")
+    bag.close()
+    run_frames(tmp_path / "drive", tmp_path / "out", FrameOptions(spacing=1e-3))
+    found = cv2.imread(str(tmp_path / "out" / "depth" / "000001.png"), cv2.IMREAD_UNCHANGED) / 1000
+    pixels = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5), axis=-1).reshape(-1, 1, 2)
+    rays = cv2.undistortPoints(pixels, COLOR, np.array(bend))[:, 0].reshape(SIZE[1], SIZE[0], 2)
+    true = 2 / (1 - SLOPE * rays[..., 0])  # the wall z = 2 + SLOPE x
+    seen = found > 0
+    assert seen.mean() > 0.7
+    assert (np.abs(found - true) < 1.01 * np.abs(np.gradient(true, axis=1)) + 2e-3)[seen].all()
+    assert np.abs(depth - true).max() > 0.1  # what depth as it was recorded is off by
