@@ -84,7 +84,7 @@ class PhotoConfig(Settings):
     _absolute = _paths("held_out", "camera", "ignore_masks", "init_points")
     memory: str | None = Field(
         None,
-        pattern=r"^[1-9][0-9]*[MG]$",
+        pattern=r"(?i)^[1-9][0-9]*[MG]i?B?$",
         title="a size such as 500M or 8G",
         description="memory for photos, labels and depth, and as much for votes of masks; what does not fit is on "
         "disk; none: a quarter of the machine's",

@@ -13,9 +13,13 @@ from scipy.ndimage import binary_erosion
 from perception.gaussians.model import Gaussians
 from perception.gaussians.views import expected_depth, render
 from perception.geometry import sums_by
+from perception.machine import require_memory
 from perception.photos.decode import scaled_K, scaled_size
 from perception.photos.depth import without_edges
 from perception.types import View
+
+BYTES_PER_PIXEL = 20
+"""Of a view: its depth, its three colours and its brightness, 4 each."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +60,12 @@ class DepthView:
 @torch.no_grad()
 def depth_views(gaussians: Gaussians, views: Sequence[View], long_side: int = 640) -> list[DepthView]:
     """Expected depth where the map is more than half opaque, edges left out, and colours; of pinhole views scaled to at
-    most `long_side` pixels."""
+    most `long_side` pixels. InputError where they do not fit into the memory."""
+    sizes = [scaled_size(view, long_side) for view in views]
+    needed = BYTES_PER_PIXEL * sum(width * height for width, height in sizes)
+    require_memory(needed, f"depth rendered from {len(views)} views", "use a machine with more memory")
     found = []
-    for view in views:
-        width, height = scaled_size(view, long_side)
+    for view, (width, height) in zip(views, sizes, strict=True):
         K = scaled_K(view, width, height)
         pose = np.asarray(view.camera_from_world, np.float64)
         camera, intrinsics = (torch.from_numpy(array.astype(np.float32)) for array in (pose, K))

@@ -303,7 +303,7 @@ def write_export(
     instances: Mapping[int, Mapping[str, Any]],
     facts: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Writes the cloud with `instance_id` and its sidecar JSON (same stem); returns the sidecar.
+    """Writes the cloud with `instance_id` and its sidecar JSON (same stem), which names it; returns the sidecar.
 
     labels [P] int32, −1 = none. instances: {id: entry} of the map, of which "score" and "label" are written with
     "num_points"; of parts also their `parent`, of groups the `instances` in them, after several visits `state` and
@@ -315,7 +315,7 @@ def write_export(
         known = instances.get(i, {})
         row = {"score": float(known.get("score", 1.0)), "label": known.get("label"), "num_points": n}
         rows[str(i)] = row | {key: known[key] for key in ("parent", "instances", "state", "last_seen") if key in known}
-    sidecar = {**(facts or {}), "instances": rows}
+    sidecar = {"cloud": path.name, **(facts or {}), "instances": rows}
     write_file(path.with_suffix(".json"), json.dumps(sidecar, indent=1))
     labelled = {"instance_id": labels.astype(np.int32)}
     write_cloud(path, replace(cloud, labels=labelled | {n: v for n, v in cloud.labels.items() if n not in labelled}))

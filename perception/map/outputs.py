@@ -52,9 +52,10 @@ def check_empty(output: Path) -> None:
 
 def check_side_file(side: Path, output: Path, key: str) -> None:
     """InputError if `side`, to be written beside `output`, is something else: JSON without a text or an object at `key`
-    (a map's instances.json has a list), .npy without ids."""
+    (a map's instances.json has a list), JSON of another `cloud` that lies there, .npy without ids."""
     if not os.path.lexists(side):
         return
+    other = ""
     try:
         if not side.is_file():  # reading a named pipe would wait for its writer
             raise ValueError
@@ -64,10 +65,15 @@ def check_side_file(side: Path, output: Path, key: str) -> None:
         else:
             found = json.loads(side.read_bytes())
             good = isinstance(found, dict) and isinstance(found.get(key), (str, dict))
+            cloud = str(found.get("cloud", output.name)) if good else output.name
+            other = cloud if cloud != output.name and (side.parent / cloud).is_file() else ""
     except (OSError, ValueError, EOFError, RecursionError):
         good = False
     if not good:
         what = f"lies there, and is not of a file such as {output.name}, beside which it would be replaced"
+        raise InputError(f"{side}: {what}; choose another name for the output")
+    if other:
+        what = f"is of {other}, which lies beside it, and would be replaced by that of {output.name}"
         raise InputError(f"{side}: {what}; choose another name for the output")
 
 

@@ -25,8 +25,10 @@ STEP_BYTES_PER_PIXEL, DECODE_BYTES_PER_PIXEL, READERS = 200, 12, 4
 
 
 def image_memory(config: MapConfig, limit: int | None) -> int:
-    """Bytes that the photos, labels and depth of a run may fill: as set, or a quarter of the `limit` of the process."""
+    """Bytes that the photos, labels and depth of a run may fill: as set, or a quarter of the `limit` of the process.
+    8G, 8gb and 8GiB are the same."""
     if (size := config.photos.memory) is not None:
+        size = size.upper().rstrip("IB")
         return int(size[:-1]) << {"M": 20, "G": 30}[size[-1]]
     return 1 << 62 if limit is None else limit // 4
 

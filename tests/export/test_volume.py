@@ -8,18 +8,20 @@ import numpy as np
 import pytest
 
 from perception.errors import InputError
-from perception.export.depth_views import DepthView
+from perception.export.depth_views import DepthView, depth_views
 from perception.export.mesh import (
     FREE,
     OCCUPIED,
     centres,
     check_outputs,
     closed_body,
+    export_mesh,
     export_voxels,
     grid_shape,
     occupancy,
     signed_distance,
 )
+from perception.gaussians.model import as_gaussians
 from perception.io.open3d import fuse_depth, write_glb
 from support import box_rooms
 from support.aimed import look_at
@@ -131,6 +133,23 @@ def test_sizes_that_no_grid_has_are_refused(voxel: float) -> None:
 def test_more_voxels_than_are_held_are_refused() -> None:
     with pytest.raises(InputError, match="voxel-size"):
         grid_shape(np.zeros(3), np.ones(3), 1e-5)
+
+
+def test_views_that_do_not_fit_into_the_memory_are_refused_before_they_are_rendered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The oracle is the size of one view's arrays."""
+    gmap = box_rooms.map_of(FURNISHED)
+    (view,) = depth_views(as_gaussians(gmap), gmap.views[:1], 640)
+    needed = len(gmap.views) * sum(a.nbytes for a in (view.depth, view.colors, view.brightness))
+    free = needed / 0.9
+    monkeypatch.setattr("perception.machine.available_memory", lambda: 0.99 * free)
+    monkeypatch.setattr("perception.export.depth_views.render", lambda *_: pytest.fail("rendered"))
+    with pytest.raises(InputError, match=rf"depth rendered from {len(gmap.views)} views: needs about .* are free"):
+        export_mesh(gmap, tmp_path / "room.ply", None, None, "original")
+    monkeypatch.setattr("perception.machine.available_memory", lambda: 1.01 * free)
+    with pytest.raises(pytest.fail.Exception, match="rendered"):
+        export_mesh(gmap, tmp_path / "room.ply", None, None, "original")
 
 
 def test_glb_holds_the_mesh(tmp_path: Path) -> None:

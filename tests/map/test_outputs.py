@@ -106,6 +106,17 @@ def test_exports_lie_in_a_maps_folder_and_are_written_anew(place: Path) -> None:
     assert main(["export", "m.gsmap", "-o", "instances.ply"]) == 2 and contents(place) == before
 
 
+def test_clouds_of_one_stem_do_not_replace_one_anothers_facts(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    export = ["export", "m.gsmap", "-o"]
+    assert main([*export, "a.ply"]) == 0
+    before, _ = contents(place), capsys.readouterr()
+    assert main([*export, "a.npz"]) == 2 and contents(place) == before
+    assert "a.json: is of a.ply, which lies beside it" in capsys.readouterr().err
+    assert main([*export, "b.npz"]) == 0 and main([*export, "a.ply"]) == 0
+    Path("a.ply").unlink()
+    assert main([*export, "a.npz"]) == 0 and json.loads(Path("a.json").read_text())["cloud"] == "a.npz"
+
+
 def test_pictures_of_photos_with_one_stem_get_names_of_their_own(place: Path) -> None:
     text = (place / "transforms.json").read_text()
     text = text.replace("photos/1", "photos/floor.1").replace("photos/2", "photos/floor.2")

@@ -12,6 +12,7 @@ from perception.config import load_config
 from perception.errors import InputError
 from perception.io import memory
 from perception.io.memory import DiskArrays, mapped_bytes
+from perception.pipeline.estimate import image_memory
 from perception.pipeline.mapping import build_map
 
 MIB = 1 << 20
@@ -93,7 +94,13 @@ def test_a_map_is_the_same_with_its_photos_on_disk(small_scene: Path, tmp_path: 
         np.testing.assert_array_equal(getattr(held, name), getattr(on_disk, name))
 
 
-@pytest.mark.parametrize("text", ["8", "0G", "-1G", "1.5G", "8 GB", "G"])
+@pytest.mark.parametrize("text", ["8G", "8g", "8GB", "8Gi", "8GiB", "8192M", "8192mb"])
+def test_a_size_in_each_spelling(text: str) -> None:
+    config = load_config(options={"photos.memory": (text, "--memory")})
+    assert image_memory(config, None) == 8 << 30
+
+
+@pytest.mark.parametrize("text", ["8", "0G", "-1G", "1.5G", "8 GB", "G", "8B", "8GIIB"])
 def test_a_size_that_is_none(text: str) -> None:
     with pytest.raises(InputError, match=r"photos\.memory: found .* expected a size such as 500M or 8G or none"):
         load_config(None, [f"photos.memory={text}"])
