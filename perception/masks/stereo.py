@@ -79,10 +79,10 @@ def make_stereo_view(view: View, photo: np.ndarray, depth: np.ndarray, keep: Kee
     ratio = SIDE / max(height, width)
     size = (max(1, round(width * ratio)), max(1, round(height * ratio)))
     known = np.isfinite(depth) & (depth > 0)
-    if known.mean() < _LEAST_DEPTH:
+    prior = cv2.resize(np.where(known, depth, 0).astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
+    if known.mean() < _LEAST_DEPTH or not prior.any():
         return None
     small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA if ratio < 1 else cv2.INTER_LINEAR)
-    prior = cv2.resize(np.where(known, depth, 0).astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
     K = scaled_K(view, *size)
     grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
     pose = np.asarray(view.camera_from_world, np.float64)

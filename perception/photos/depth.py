@@ -55,7 +55,13 @@ def load_depth(view: View, width: int, height: int) -> np.ndarray:
     if not same_aspect(size, (lens.width, lens.height)):
         found = f"the depth image is {size[0]}×{size[1]}, its camera {lens.width}×{lens.height}"
         raise InputError(f"{view.depth.path}: {found}; expected the same field of view at any resolution")
-    return warped(image, view, rescale_lens(lens, *size), width, height) * np.float32(view.depth.scale)
+    lens = rescale_lens(lens, *size)
+    depth = warped(image, view, lens, width, height)
+    if not depth.any() and image.any():  # a grid of points, all of which lie between the pixels that are sampled
+        more = -(-max(size) // max(width, height))
+        blocks = warped(image, view, lens, more * width, more * height).reshape(height, more, width, more)
+        depth = blocks.max(axis=(1, 3))
+    return depth * np.float32(view.depth.scale)
 
 
 def without_edges(depth: np.ndarray) -> np.ndarray:

@@ -165,6 +165,16 @@ def test_measured_depth_is_confirmed_without_stereo(monkeypatch):
     assert np.median(np.concatenate(errors)) < 0.0067 / 2  # 0.0067 is the median of one; at least 4 are averaged
 
 
+def test_a_photo_of_which_stereo_sees_no_depth_is_not_used():
+    """At half the size only pixels of odd rows are seen."""
+    photo, depth = np.zeros((480, 640, 3), np.uint8), np.zeros((480, 640))
+    depth[1::2] = 2
+    view = View("a.jpg", Path("a.jpg"), K, 640, 480, np.eye(4))
+    assert make_stereo_view(view, photo, depth) is None
+    made = make_stereo_view(view, photo, np.roll(depth, 1, axis=0))
+    assert made is not None and (made.prior == 2).all()
+
+
 def bare_view(pose: np.ndarray) -> StereoView:
     """A camera without a photo."""
     none = np.zeros((120, 160), np.float32)

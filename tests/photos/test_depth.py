@@ -64,6 +64,18 @@ def test_depth_of_a_camera_of_its_own(tmp_path):
     assert np.abs(found - 2 / (1 - 0.3 * x)).max() < 0.3 * 2.5**2 / 2 / 25 + 1e-3
 
 
+def test_a_grid_of_points_between_the_sampled_pixels_is_found(tmp_path):
+    """Every 8th pixel of both axes has depth, and of those every fourth or second is sampled."""
+    for shift in range(4):
+        image = np.zeros((192, 256))
+        image[shift::8, shift::8] = _wall(PINHOLE, 256, 192)[shift::8, shift::8]
+        found = load_depth(_view(PINHOLE, tmp_path, image), 64, 48)
+        x = np.broadcast_to((np.arange(64) + 0.5 - 32) / 50, found.shape)
+        seen = found > 0
+        assert seen.mean() == 1 / 4
+        assert np.abs(found - 2 / (1 - 0.3 * x))[seen].max() < 0.3 * 2.5**2 / 2 / 50 + 1e-3  # half a pixel
+
+
 def test_pixels_without_depth_stay_without(tmp_path):
     image = _wall(PINHOLE, 64, 48)
     image[:10], image[10:20] = 0, 65535
