@@ -43,7 +43,7 @@ _WORDS = {
 }
 _KIND = {word: kind for kind, words in _WORDS.items() for word in words.split()}
 _SAME = str.maketrans({"0": "o", "1": "l", "i": "l", "|": "l", "5": "s", "8": "b", "2": "z"})
-_WORD, _LETTER = re.compile(r"\w+"), re.compile(r"\w")
+_WORD, _LETTER = re.compile(r"[^\W_]+"), re.compile(r"\w")
 
 
 def quoted_text(prompt: str) -> tuple[str, str] | None:

@@ -125,7 +125,7 @@ class MapStore:
     ) -> list[Hit]:
         """The instances that answer `text` in their own maps, best first, at most top_k, in the frames of their maps.
         `min_score`: all with this score instead. Raises InputError as `QueryMap.query`, and for `where` and `frame`."""
-        check_prompt(text, top_k, min_score)
+        text = check_prompt(text, top_k, min_score)
         if where is not None or frame is not None:
             what = "is a store, whose maps have their own frames"
             raise InputError(f"{self.path}: {what}; give where and frame to a map")

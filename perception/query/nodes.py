@@ -91,7 +91,7 @@ class Nodes:
         special = shape_kind(text) or parse(text) or quoted_text(text)
         if not self._nodes or not hits or special or hits[0][1] == 1.0:
             return list(hits)
-        scores, z = self._scored(" ".join(text.split()))
+        scores, z = self._scored(text)
         chosen, replaced = list[Candidate](), set[int]()
         wholes = self._ranker.encoder.reading.wholes
         for n, node in enumerate(self._nodes, start=len(hits)):

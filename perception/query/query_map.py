@@ -117,7 +117,7 @@ class QueryMap(Map):
         that answer are then decided among these. Raises InputError for an empty or overlong text, and
         for a map without embeddings or whose encoder is not installed.
         """
-        check_prompt(text, top_k, min_score)
+        text = check_prompt(text, top_k, min_score)
         if not self.instances:
             return []
         ranked, wanted = self._ranking.rank(text), wanted_in_map(where, frame)
@@ -221,7 +221,7 @@ class QueryMap(Map):
     ) -> list[Hit]:
         """As `query`, the instances that are gone and answer `text` when they are compared with all others: hits where
         they stood last, with `since` and, where it is known, what they `stood` on."""
-        check_prompt(text, top_k, min_score)
+        text = check_prompt(text, top_k, min_score)
         spots, hits = self._left, list[Hit]()
         for hit in self.last_known.query(text, MAX_TOP, min_score, where=where, frame=frame) if spots else ():
             if hit.instance_id in spots and len(hits) < top_k:

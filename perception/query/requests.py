@@ -17,13 +17,15 @@ class UnknownInstance(InputError):
     """The map has no instance with this id."""
 
 
-def check_prompt(text: Any, top_k: Any = TOP, min_score: Any = None) -> None:
-    """InputError unless `text` is a text that is neither empty nor too long, and the numbers are in their range."""
+def check_prompt(text: Any, top_k: Any = TOP, min_score: Any = None) -> str:
+    """The text with white space and "_", as in "milk_carton", as single spaces. InputError unless it is a text that is
+    neither empty nor too long, and the numbers are in their range."""
     if not isinstance(text, str):
         raise InputError(f"query: the text is {type(text).__name__}, expected a text")
     if any("\ud800" <= letter <= "\udfff" for letter in text):
         raise InputError("query: the text holds bytes that are no UTF-8, or half of a surrogate pair; mend it")
-    if not text.strip():
+    words = " ".join(text.replace("_", " ").split())
+    if not words:
         raise InputError('query: the text is empty; ask for a thing, such as "red mug"')
     if len(text) > MAX_TEXT:
         raise InputError(f"query: the text has {len(text)} characters, expected at most {MAX_TEXT}")
@@ -34,8 +36,9 @@ def check_prompt(text: Any, top_k: Any = TOP, min_score: Any = None) -> None:
             f"query: the number of hits (top_k, --top) is {top_k}, expected at least 1 and at most {MAX_TOP}"
         )
     if min_score is None:
-        return
+        return words
     if isinstance(min_score, bool) or not isinstance(min_score, (int, float, np.number)):
         raise InputError(f"query: min_score is {min_score!r}, expected a number or none")
     if not -np.inf < min_score < np.inf:
         raise InputError(f"query: min_score is {min_score}, expected a finite number")
+    return words

@@ -47,7 +47,7 @@ class TextRanking:
             if named or any(tidy(name or "") == tidy(text) for name in self._names):
                 return named
             raise
-        rows, scores = self._remembered(" ".join(text.split()))
+        rows, scores = self._remembered(text)
         return list(zip(rows.tolist(), scores.tolist(), strict=True))
 
     def _ranked(self, text: str) -> tuple[np.ndarray, np.ndarray]:

@@ -134,8 +134,8 @@ def position_of(point_or_pose: Any) -> np.ndarray:
 
 
 def tidy(text: str) -> str:
-    """A label normalised for comparison: case-folded, accents composed (NFC), runs of white space replaced by one."""
-    return " ".join(normalize("NFC", text.casefold()).split())
+    """A label normalised for comparison: case-folded, accents composed (NFC), runs of white space and "_" one space."""
+    return " ".join(normalize("NFC", text.casefold()).replace("_", " ").split())
 
 
 def axis_box(low: Sequence[float] | np.ndarray, high: Sequence[float] | np.ndarray) -> OrientedBox:

@@ -194,7 +194,7 @@ def test_labels_are_compared_without_regard_to_capitals_and_to_how_accents_are_w
     scene: tuple[Table, list[InstanceDescription]],
 ) -> None:
     encoder, things = scene
-    for label, prompt in (("Cafe\u0301", "caf\u00c9"), ("Straße", "STRASSE")):
+    for label, prompt in (("Cafe\u0301", "caf\u00c9"), ("Straße", "STRASSE"), ("my_cup", "My cup")):
         assert rank(prompt, things, encoder, labels=[None, label, None, None])[0] == (1, 1.0)
 
 

@@ -132,6 +132,19 @@ def test_a_name_that_says_not_is_found_by_it(tmp_path: Path) -> None:
             load_map(path, encoders).query("not for rent")
 
 
+def test_an_underscore_is_a_space(tmp_path: Path) -> None:
+    """As in the names of classes and of ROS; "milk_carton" was another text, which other things answered."""
+    write_map_of(tmp_path / "m.gsmap", ["milk carton", "red mug", "kettle"])
+    set_labels(tmp_path / "m.gsmap", {2: "tea_pot"})
+    index_maps(tmp_path / "all.store", [tmp_path / "m.gsmap"], encoders=encoders)
+    for path in (tmp_path / "m.gsmap", tmp_path / "all.store"):
+        asked = load_map(path, encoders)
+        for text, number in (("milk_carton", 0), ("_red_mug ", 1), ("Tea pot", 2), ("tea_pot", 2)):
+            assert [hit.instance_id for hit in asked.query(text)] == [number]
+        with pytest.raises(InputError, match="lacks"):
+            asked.query("mug_without_a_handle")
+
+
 def test_the_prompts_above_are_about_something(maps: list[Path]) -> None:
     """Each kind of evidence changes scores in some of the maps, so that its absence from a store would be seen."""
     scores = {text: {key: hit.score for key, hit in one_by_one(maps, text, 1000, 0.0).items()} for text in PROMPTS}
