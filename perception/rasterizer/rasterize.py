@@ -208,12 +208,28 @@ def _check(
             wanted = "float32 or float64" if t is means else means.dtype
             raise InputError(f"rasterize: {name} is {t.dtype}, expected {wanted}")
     _check_shapes(tensors, sh_degree)
+    _check_cameras(tensors["viewmats"], tensors["Ks"])
     if width not in _SIDES or height not in _SIDES:
         raise InputError(f"rasterize: image size {width} × {height}, expected 1 to {_SIDES[-1]} whole pixels a side")
     if not (near_plane >= 0 and near_plane < float("inf")):
         raise InputError(f"rasterize: near_plane is {near_plane}, expected a finite number ≥ 0")
     if not 0.01 <= eps2d <= 1e4:
         raise InputError(f"rasterize: eps2d is {eps2d}, expected 0.01 to 10000 px²")
+
+
+def _check_cameras(viewmats: Any, Ks: Any) -> None:
+    """InputError for a camera with entries that would not be used: those of a transposed pose, or of skew."""
+    pose = "the last row [0, 0, 0, 1]; 3DGS and its descendants keep this matrix transposed"
+    for name, fixed, expected in (
+        ("viewmats", viewmats.detach()[:, 3], pose),
+        ("Ks", Ks.detach()[:, (0, 1, 2, 2, 2), (1, 0, 0, 1, 2)], "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"),
+    ):
+        wanted = torch.zeros_like(fixed)
+        wanted[:, -1] = 1
+        wrong = (fixed.isfinite() & ((fixed - wanted).abs() > 1e-4)).any(dim=1).nonzero()[:, 0].tolist()
+        if wrong:
+            found = (viewmats if name == "viewmats" else Ks)[wrong[0]].tolist()
+            raise InputError(f"rasterize: {name}[{wrong[0]}] is {found}, expected {expected}")
 
 
 def _check_shapes(tensors: dict[str, Any], sh_degree: int | None) -> None:
