@@ -22,7 +22,7 @@ from perception.geometry import transform
 from perception.localise.evidence import doubt
 from perception.localise.joint import Adjustment, adjusted, contradicted
 from perception.localise.keypoints import described, tolerance
-from perception.localise.pose import GUESSED, KNOWN, LIKELY, MIN_INLIERS, Matched, find_pose
+from perception.localise.pose import GUESSED, KNOWN, LIKELY, MIN_INLIERS, Matched, cropped, find_pose
 from perception.localise.reference import Locate, Reference, open_reference
 from perception.map.map import Map
 from perception.photos.decode import CAMERA_FOLDER, exif_of, open_photo, photo_size, why_left_out
@@ -193,15 +193,20 @@ class _Search:
         return [self._answer(number, found) for number in range(len(self.photos))]
 
     def _share_lenses(self, candidates: dict[int, np.ndarray]) -> None:
-        """Photos with one assumed lens were taken by one camera: all get the median of the estimates."""
+        """Photos with one assumed lens were taken by one camera: all get the median of the estimates. A photo that was
+        cropped keeps its own: others are cropped elsewhere."""
         shared, lenses = dict[Lens, list[Lens]](), [view_lens(view) for view in self.views]
-        for number in sorted(number for number in self.placed if self.trust[number] != KNOWN):
-            shared.setdefault(lenses[number], []).append(self.lenses[number])
+        known, own = [trust == KNOWN for trust in self.trust], dict[int, Lens]()
+        for number in sorted(number for number in self.placed if not known[number]):
+            if cropped(lenses[number], self.lenses[number]):
+                own[number] = self.lenses[number]
+            else:
+                shared.setdefault(lenses[number], []).append(self.lenses[number])
         chosen = {lens: _median(found) for lens, found in shared.items()}
-        if all(lens == found for lens, found in chosen.items()):
+        if not own and all(lens == found for lens, found in chosen.items()):
             return
-        known = [trust == KNOWN for trust in self.trust]
-        self._see([lens if sure else chosen.get(lens, lens) for lens, sure in zip(lenses, known, strict=True)])
+        others = [lens if sure else chosen.get(lens, lens) for lens, sure in zip(lenses, known, strict=True)]
+        self._see([own.get(number, lens) for number, lens in enumerate(others)])
         self.trust = (KNOWN,) * len(lenses)
         self.placed.clear()
         self.links.clear()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from perception.localise.localiser import _median
-from perception.localise.pose import GUESSED, KNOWN, LIKELY, MIN_INLIERS, Matched, Pose, find_pose
+from perception.localise.pose import GUESSED, KNOWN, LIKELY, MIN_INLIERS, Matched, Pose, cropped, find_pose
 from perception.types import Lens
 from support.painted_room import difference, pose_at
 
@@ -95,6 +95,21 @@ def test_a_guessed_lens_is_estimated(focal: float) -> None:
     assert isinstance(found, Pose)
     assert found.lens.params[0] == pytest.approx(focal, rel=0.02)
     assert difference(found.camera_from_map, POSE)[0] < 0.1
+
+
+@pytest.mark.parametrize("guess", [LENS, Lens("SIMPLE_RADIAL", (768.0, 320.0, 240.0, 0.0), 640, 480)])
+@pytest.mark.parametrize("corner", [(0.0, 0.0), (640.0, 480.0), (0.0, 240.0)])
+def test_the_principal_point_of_a_cropped_photo_is_estimated(corner: tuple[float, float], guess: Lens) -> None:
+    """A part of a photo of twice the size, whose middle is not the part's: the place was wrong by metres, with a
+    standard error of millimetres."""
+    true = Lens("PINHOLE", (1000.0, 1000.0, 640.0 - corner[0], 480.0 - corner[1]), 640, 480)
+    whole = matches((POSE, 1500), lens=true)
+    inside = ((whole.pixel >= 0) & (whole.pixel < (640, 480))).all(axis=1)
+    part = Matched(*(array[inside] for array in (whole.feature, whole.pixel, whole.point)))
+    found = find_pose(part, guess, LIKELY, sure)
+    assert isinstance(found, Pose) and cropped(guess, found.lens)
+    assert difference(found.camera_from_map, POSE)[0] < 0.05
+    assert np.allclose(found.lens.params, true.params, atol=15)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 4])
