@@ -17,10 +17,12 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
+from perception.geometry import align_similarity
 from perception.io.cloud import read_cloud, to_int32
 from perception.io.documents import refusing
 from perception.types import PointCloud
 
+SAME_POINTS = 0.02  # median distance of points, as a share of the cloud's diagonal, up to which clouds are the same
 OBJECT = 1  # the only class in class-agnostic evaluation
 
 
@@ -299,6 +301,9 @@ def run_instances(prediction: str | Path, truth: str | Path, protocol: str = "sc
     if len(pred_ids) != len(gt_ids):
         counts = f"{prediction}: has {len(pred_ids)} points, the truth {truth} has {len(gt_ids)}"
         raise InputError(f"{counts}; both must be the same points in the same order")
+    if (off := _apart(pred.points, gt.points)) > SAME_POINTS:
+        found = f"half of its points lie over {off:.0%} of the cloud's size from those of the truth {truth}"
+        raise InputError(f"{prediction}: {found}; label the truth's own points, in their order")
     rules, source = get_protocol(protocol), Path(prediction).with_suffix(".json")
     confidence = read_scores(source) if source.is_file() else None
     if confidence is not None and (lacking := set(pred_ids[pred_ids >= 0].tolist()) - confidence.keys()):
@@ -311,6 +316,18 @@ def run_instances(prediction: str | Path, truth: str | Path, protocol: str = "sc
     constant = rules.constant_score or confidence is None
     result["protocol"]["confidence"] = "constant 1.0" if constant else str(source)
     return result, instances_table(result)
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> float:
+    """Median distance of the points [N, 3] of two clouds by their order, as a share of the cloud's diagonal, in the
+    best common frame, as one may have been moved; 0 for clouds that have none."""
+    known = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
+    a, b = a[known].astype(np.float64), b[known].astype(np.float64)
+    if len(a) < 4 or not (np.ptp(a, axis=0).any() and np.ptp(b, axis=0).any()):
+        return 0.0
+    scale, rotation, shift = align_similarity(a, b)
+    off = np.linalg.norm(a - scale * b @ rotation.T - shift, axis=1)
+    return float(np.median(off) / np.linalg.norm(np.ptp(a, axis=0)))
 
 
 def read_scores(path: str | Path) -> dict[int, float]:

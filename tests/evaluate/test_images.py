@@ -129,6 +129,22 @@ def test_clouds_of_different_length_or_without_ids_are_told(tmp_path):
         run_instances(tmp_path / "c.ply", tmp_path / "a.ply")
 
 
+def test_the_same_points_in_another_order_are_told(tmp_path):
+    """A perfect prediction, saved in another order, scored 0. A frame of its own is no other order."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (4000, 3)).astype(np.float32)
+    ids = np.digitize(points[:, 0], [-0.5, 0, 0.5]).astype(np.int32) + 1
+    order = rng.permutation(4000)
+    turned = (
+        points[:, [1, 2, 0]] * 1.3 + np.float32([100, 20, 3]) + rng.normal(0, 1e-3, points.shape).astype(np.float32)
+    )
+    for name, xyz, label in (("gt", points, ids), ("turned", turned, ids), ("mixed", points[order], ids[order])):
+        write_cloud(tmp_path / f"{name}.ply", PointCloud(xyz, labels={"instance_id": label}))
+    assert run_instances(tmp_path / "turned.ply", tmp_path / "gt.ply")[0]["ap"] == 1
+    with pytest.raises(InputError, match=r"mixed\.ply: half of its points lie over \d+%"):
+        run_instances(tmp_path / "mixed.ply", tmp_path / "gt.ply")
+
+
 def test_two_hundred_by_two_hundred_on_a_million_points():
     rng = np.random.default_rng(0)
     gt = rng.integers(1, 201, 1_000_000)
