@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -74,6 +75,11 @@ class Hit:
     since: int | None = None
     was: np.ndarray | None = None
     stood: tuple[str, int] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For pickle and deepcopy: points and colours as they are read now, and nothing of the map."""
+        colors = None if self.colors is None else partial(np.asarray, self.colors())
+        return {**vars(self), "_points": self.points, "colors": colors}
 
     @property
     def num_points(self) -> int:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import shutil
 from collections.abc import Sequence
+from copy import deepcopy
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -130,6 +132,15 @@ def test_a_name_that_says_not_is_found_by_it(tmp_path: Path) -> None:
         assert [hit.instance_id for hit in load_map(path, encoders).query("Not for sale")] == [2]
         with pytest.raises(InputError, match="says what a thing is not"):
             load_map(path, encoders).query("not for rent")
+
+
+def test_a_hit_is_copied_and_pickled_without_its_map(store: Path, maps: list[Path]) -> None:
+    """As multiprocessing sends it to a planner's process: "cannot pickle '_thread.lock' object"."""
+    for path in (maps[1], store):
+        hit = load_map(path, encoders).query("kettle")[0]
+        for same in (pickle.loads(pickle.dumps(hit)), deepcopy(hit)):
+            assert same.to_json() == hit.to_json() and np.array_equal(same.points, hit.points)
+            assert hit.colors is not None and np.array_equal(same.colors(), hit.colors())
 
 
 def test_an_underscore_is_a_space(tmp_path: Path) -> None:
