@@ -108,7 +108,7 @@ def test_places_are_judged_right(world: dict[str, Any]) -> None:
     assert [hit.instance_id for hit in world["nearest"]] == sorted(gaps, key=lambda k: gaps[k])[:3]
     assert np.isclose(world["clearance"], min(gaps.values()))
     assert [hit.instance_id for hit in world["blocking"]] == [1]
-    assert world["pointed"].instance_id == 4 and world["told"].hit.instance_id == 4
+    assert world["pointed"].instance_id == 4 and world["thing"].hit.instance_id == 4
     assert np.allclose(world["spread"], SIGMA, rtol=0.2) and np.isclose(np.linalg.norm(world["axis"]), 1)
     assert world["goal"] is None  # the map has no gravity; places are tested in test_standing.py
 
