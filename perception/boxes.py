@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from perception.geometry import scale_of
+from perception.errors import InputError
+from perception.geometry import check_similarity, numbers, scale_of, transform
 from perception.types import OrientedBox
 
 BOX_TRIM = 0.01
@@ -104,3 +105,23 @@ def instance_entry(
         "obb": oriented_box(points, BOX_TRIM).to_json(),
         "aabb": {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()},
     }
+
+
+def inside(box: OrientedBox, points: np.ndarray) -> np.ndarray:
+    """Which of points [P, 3] lie in `box`, borders included: bool [P]."""
+    local = (np.asarray(points, np.float64) - box.center) @ np.asarray(box.rotation).T
+    return (np.abs(local) <= np.asarray(box.extent) / 2).all(axis=1)
+
+
+def check_box(box: Any) -> OrientedBox:
+    """The box with float64 arrays; InputError unless its rotation is a rotation matrix and its extent is >= 0."""
+    if not isinstance(box, OrientedBox):
+        raise InputError(f"region: found {type(box).__name__}, expected an OrientedBox or axis_box(low, high)")
+    center, extent = numbers(box.center, "region: center"), numbers(box.extent, "region: extent")
+    rotation = numbers(box.rotation, "region: rotation")
+    if center.shape != (3,) or extent.shape != (3,) or rotation.shape != (3, 3) or (extent < 0).any():
+        raise InputError("region: expected a center [3], an extent [3] >= 0 and a rotation [3, 3]")
+    check_similarity(transform(rotation, [0.0, 0.0, 0.0]), "region: rotation")
+    if abs(np.linalg.det(rotation) - 1) > 1e-3:
+        raise InputError("region: rotation is scaled, expected rows of length 1")
+    return OrientedBox(center, rotation, extent)

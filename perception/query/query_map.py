@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from perception.boxes import check_box
 from perception.errors import InputError
 from perception.geometry import move_points, scale_of
 from perception.io.documents import brief
@@ -26,7 +27,7 @@ from perception.query.past import Spot, present, scene
 from perception.query.ranking import Ranker, answering
 from perception.query.requests import MAX_TOP, TOP, UnknownInstance, check_prompt
 from perception.query.text_ranking import Encoders, TextRanking
-from perception.query.where import Frame, Where, check_box, check_frame, check_length, position_of, wanted_in_map
+from perception.query.where import Frame, Where, check_frame, check_length, position_of, wanted_in_map
 from perception.types import DepthImage, Lens, OrientedBox, View
 
 if TYPE_CHECKING:

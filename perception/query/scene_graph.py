@@ -33,6 +33,9 @@ CLEAR = 0.5  # of several supports the highest counts whose score is at least th
 SHELL = 0.6  # share of the map's extent along two axes from which an instance is a wall, a floor or a ceiling
 RING = 0.4  # width of the ring, as a share of the foot's shorter side
 FLAT = 0.15  # most thickness of what hangs on a wall, as a share of its size
+BESIDE, UPPER, LEVEL = 0.8, 0.5, 0.1
+"""Of what a thing may be in: distance of its points from the thing's middle, relative to the thing's half sides, from
+which they are beside it; relative height from which these are walls; least share of walls: fewer are noise."""
 TOUCHING = 0.05  # least share of the points of what is attached that touch what holds it
 HIDDEN = 0.5  # share of a thing's height, at its foot, that no photo may have seen
 MATCH = 0.5  # least match of `LevelBoxes` for "in" and "next to"
@@ -117,13 +120,8 @@ def _level_things(gmap: Map) -> tuple[list[np.ndarray], LevelBoxes] | None:
 
 def holders(points: list[np.ndarray], boxes: LevelBoxes) -> list[Holder | None]:
     """What holds each instance; None where nothing does. points: of the instances, [P, 3] each, z up."""
-    shell, sizes, inside = _shells(boxes), boxes.highs - boxes.lows, boxes.match("in")
-    typical = float(np.median(sizes[~shell].max(axis=1))) if (~shell).any() else 0.0
-    trees = {j: cKDTree(cloud) for j, cloud in enumerate(points) if len(cloud)}
-    held: list[Holder | None] = []
-    for n, mine in enumerate(points):
-        slack = 0.02 * typical + min(0.25 * sizes[n, 2], 0.1 * typical)
-        held.append(None if shell[n] or len(mine) == 0 else _holder(n, points, trees, boxes, shell, inside[n], slack))
+    things = _Things(points, boxes)
+    held = [things.holder(n) for n in range(len(points))]
     for n, holder in enumerate(held):  # of two things that hold each other, nothing holds the lower one
         other = None if holder is None else held[holder.position]
         if holder is not None and other is not None and other.position == n:
@@ -131,65 +129,86 @@ def holders(points: list[np.ndarray], boxes: LevelBoxes) -> list[Holder | None]:
     return held
 
 
-def _holder(
-    n: int,
-    points: list[np.ndarray],
-    trees: dict[int, cKDTree],
-    boxes: LevelBoxes,
-    shell: np.ndarray,
-    inside: np.ndarray,
-    slack: float,
-) -> Holder | None:
-    mine, low, size = points[n], boxes.lows[n], boxes.highs[n] - boxes.lows[n]
-    others = [j for j in range(len(points)) if j != n and len(points[j])]
-    middle = (boxes.lows[n] + boxes.highs[n])[:2] / 2
+class _Things:
+    """I instances, among which one holds another. points: [P, 3] of each, z up; boxes: theirs."""
 
-    def around(xy: np.ndarray) -> float:
-        """Share of the directions from the thing in which there are such points."""
-        turn = np.arctan2(*(xy - middle).T[::-1])
-        return len(np.unique(np.floor((turn / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS)) / SECTORS
+    def __init__(self, points: list[np.ndarray], boxes: LevelBoxes) -> None:
+        self.points, self.lows, self.highs, self.sizes = points, boxes.lows, boxes.highs, boxes.highs - boxes.lows
+        self.shell, self.inside = _shells(boxes), boxes.match("in")
+        self.floors = self.shell & (self.sizes[:, 2] < 0.5 * self.sizes[:, :2].min(axis=1))
+        typical = float(np.median(self.sizes[~self.shell].max(axis=1))) if (~self.shell).any() else 0.0
+        self.slack = 0.02 * typical + np.minimum(0.25 * self.sizes[:, 2], 0.1 * typical)  # of heights, for noise
+        self.trees = {j: cKDTree(cloud) for j, cloud in enumerate(points) if len(cloud)}
 
-    for j in np.argsort(-inside, kind="stable"):
-        if inside[j] < MATCH:
-            break
-        beside = points[j][(np.abs(points[j][:, :2] - middle) >= 0.8 * size[:2] / 2).any(axis=1)]
-        walls = beside[beside[:, 2] >= low[2] + 0.5 * size[2]]
-        flat = len(walls) < 0.1 * len(beside)  # what stands above is the noise of a level surface
-        if not shell[j] and not flat and around(walls[:, :2]) >= LEAST_WALLS:
-            return Holder(int(j), "in", float(inside[j]))
-    reach = 2 * slack + float(size.min())
-    away = np.maximum(boxes.lows - boxes.highs[n], boxes.lows[n] - boxes.highs).max(axis=1)
-    near = {j: trees[j].query(mine, distance_upper_bound=reach)[0] for j in others if away[j] <= 2 * reach}
-    touches = {j: float(np.isfinite(near[j]).mean()) if j in near else 0.0 for j in others}
-    flat = size[:2].min() < FLAT * size.max()
-    upright = [j for j in others if shell[j] and boxes.highs[j, 2] - boxes.lows[j, 2] > size[2]]
-    wall = max(upright, key=lambda j: touches[j], default=None)
-    if flat and wall is not None and touches[wall] >= TOUCHING:
-        return Holder(wall, "attached to", touches[wall])
-    foot = mine[mine[:, 2] <= low[2] + slack + 0.1 * size[2]][:, :2]
-    tree, width = cKDTree(foot if len(foot) else mine[:, :2]), max(RING * float(size[:2].min()), 3 * slack)
-    over = (boxes.lows[:, :2] <= middle).all(axis=1) & (middle <= boxes.highs[:, :2]).all(axis=1)
-    spans = boxes.highs - boxes.lows
-    floors = shell & (spans[:, 2] < 0.5 * spans[:, :2].min(axis=1))
-    under = [j for j in others if floors[j] or (over[j] and not shell[j])]
-    for wide in (width, 3 * width):  # of a corner behind furniture little floor is seen
-        tops: list[tuple[float, float, int]] = []  # height, score, position
-        for j in under:
-            near = points[j][points[j][:, 2] >= low[2] - max(3 * slack, HIDDEN * size[2])]
-            near = near[np.isfinite(tree.query(near[:, :2], distance_upper_bound=wide)[0])] if len(near) else near
-            below = near[near[:, 2] <= low[2] + slack]
-            share = around(below[:, :2])
-            if share >= LEAST_RING:  # a neighbour is higher beside the thing
-                tops.append((float(np.quantile(below[:, 2], 0.9)), share * len(below) / len(near), j))
-        if tops:
-            best_score = max(score for _, score, _ in tops)
-            _, score, j = max(top for top in tops if top[1] >= CLEAR * best_score)
-            return Holder(j, "on", score)
-    best = max(others, key=lambda j: touches[j], default=None)
-    if best is not None and touches[best] >= TOUCHING:
-        return Holder(best, "attached to", touches[best])
-    flats = [j for j in under if floors[j] and low[2] - size[2] <= boxes.highs[j, 2] <= low[2] + slack]
-    return Holder(max(flats, key=lambda j: boxes.highs[j, 2]), "on", 1 / SECTORS) if flats else None
+    def holder(self, n: int) -> Holder | None:
+        """What thing n is in, hangs on, stands on or else touches; at last the floor that is nearest below its foot."""
+        if self.shell[n] or len(self.points[n]) == 0:
+            return None
+        middle = (self.lows[n] + self.highs[n])[:2] / 2
+        if (container := self._container(n, middle)) is not None:
+            return container
+        touches, tall = self._touches(n), self.sizes[n, 2]
+        flat = self.sizes[n, :2].min() < FLAT * self.sizes[n].max()
+        walls = {j: share for j, share in touches.items() if flat and self.shell[j] and self.sizes[j, 2] > tall}
+        over = ((self.lows[:, :2] <= middle) & (middle <= self.highs[:, :2])).all(axis=1)
+        under = [j for j in touches if self.floors[j] or (over[j] and not self.shell[j])]
+        if found := _most_touched(walls) or self._support(n, middle, under) or _most_touched(touches):
+            return found
+        off = self.highs[:, 2] - self.lows[n, 2]
+        floors = [j for j in under if self.floors[j] and -tall <= off[j] <= self.slack[n]]
+        return Holder(max(floors, key=lambda j: off[j]), "on", 1 / SECTORS) if floors else None
+
+    def _container(self, n: int, middle: np.ndarray) -> Holder | None:
+        """What has the thing's box in its own, and walls around it."""
+        for j in np.argsort(-self.inside[n], kind="stable"):
+            if self.inside[n, j] < MATCH:
+                break
+            apart = np.abs(self.points[j][:, :2] - middle) >= BESIDE * self.sizes[n, :2] / 2
+            beside = self.points[j][apart.any(axis=1)]
+            walls = beside[beside[:, 2] >= self.lows[n, 2] + UPPER * self.sizes[n, 2]]
+            flat = len(walls) < LEVEL * len(beside)  # a level surface
+            if not self.shell[j] and not flat and _around(walls[:, :2], middle) >= LEAST_WALLS:
+                return Holder(int(j), "in", float(self.inside[n, j]))
+        return None
+
+    def _touches(self, n: int) -> dict[int, float]:
+        """Of each other instance the share of the thing's points that are near it."""
+        mine, reach = self.points[n], 2 * self.slack[n] + float(self.sizes[n].min())
+        near = np.maximum(self.lows - self.highs[n], self.lows[n] - self.highs).max(axis=1) <= 2 * reach
+        others = {j: tree for j, tree in self.trees.items() if j != n}
+        away = {j: tree.query(mine, distance_upper_bound=reach)[0] for j, tree in others.items() if near[j]}
+        return {j: float(np.isfinite(away[j]).mean()) if near[j] else 0.0 for j in others}
+
+    def _support(self, n: int, middle: np.ndarray, under: list[int]) -> Holder | None:
+        """The highest surface in a ring around the thing's foot, of those that fill it well."""
+        mine, low, size, slack = self.points[n], self.lows[n, 2], self.sizes[n], self.slack[n]
+        foot = mine[mine[:, 2] <= low + slack + 0.1 * size[2]][:, :2]
+        tree, width = cKDTree(foot if len(foot) else mine[:, :2]), max(RING * float(size[:2].min()), 3 * slack)
+        for wide in (width, 3 * width):  # of a corner behind furniture little floor is seen
+            tops: list[tuple[float, float, int]] = []  # height, score, position
+            for j in under:
+                near = self.points[j][self.points[j][:, 2] >= low - max(3 * slack, HIDDEN * size[2])]
+                near = near[np.isfinite(tree.query(near[:, :2], distance_upper_bound=wide)[0])] if len(near) else near
+                below = near[near[:, 2] <= low + slack]
+                share = _around(below[:, :2], middle)
+                if share >= LEAST_RING:  # a neighbour is higher beside the thing
+                    tops.append((float(np.quantile(below[:, 2], 0.9)), share * len(below) / len(near), j))
+            if tops:
+                best_score = max(score for _, score, _ in tops)
+                _, score, j = max(top for top in tops if top[1] >= CLEAR * best_score)
+                return Holder(j, "on", score)
+        return None
+
+
+def _most_touched(touches: dict[int, float]) -> Holder | None:
+    best = max(touches, key=lambda j: touches[j], default=None)
+    return None if best is None or touches[best] < TOUCHING else Holder(best, "attached to", touches[best])
+
+
+def _around(points: np.ndarray, middle: np.ndarray) -> float:
+    """Share of the SECTORS about `middle` [2] in which there are points [P, 2]."""
+    turn = np.arctan2(*(points - middle).T[::-1])
+    return len(np.unique(np.floor((turn / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS)) / SECTORS
 
 
 def _shells(boxes: LevelBoxes) -> np.ndarray:

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
+from perception.boxes import inside
 from perception.map.map import InstanceIndex
-from perception.query.where import inside
 from perception.types import OrientedBox
 
 _NEIGHBORS = 8
