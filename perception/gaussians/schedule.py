@@ -104,9 +104,7 @@ def after_step(state: TrainingState, progress: float, may_stop: bool) -> None:
             _clear_cameras(state)
     if state.iteration % (5 * every) == 0 and state.progress < 1.0:
         _add_to_curve(state, progress)
-    if (
-        state.progress >= STOP and state.has_labels and not (state.placed or state.held)
-    ):  # an update adds in its own way
+    if state.progress >= STOP and state.has_labels and not (state.placed or state.held):  # `visits` adds in its own way
         state.placed = True
         _place_in_masks(state)
     if due and may_stop:

@@ -102,8 +102,8 @@ def without_strays(ids: np.ndarray, means: np.ndarray, opacities: np.ndarray, mi
     if near < 2:
         return ids
     others = voters[nearest(cKDTree(means[voters]), means[rows], range(1, near + 1))[1]]
-    row, place = np.nonzero(ids[others] == ids[rows][:, None])
-    links = sparse.coo_matrix((np.ones(len(row), bool), (rows[row], others[row, place])), shape=(len(ids), len(ids)))
+    row, column = np.nonzero(ids[others] == ids[rows][:, None])
+    links = sparse.coo_matrix((np.ones(len(row), bool), (rows[row], others[row, column])), shape=(len(ids), len(ids)))
     piece = csgraph.connected_components(links, directed=False)[1]
     size = np.bincount(piece)[piece]
     largest = np.zeros(ids.max() + 1, np.int64)

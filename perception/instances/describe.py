@@ -28,6 +28,7 @@ class Unread:
     """Stands for an encoder where only the views, boxes and colours of instances are wanted: embeddings are zeros."""
 
     dim: int
+    identity: str = ""
 
     def encode_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
         return np.zeros((len(images), self.dim), np.float32)

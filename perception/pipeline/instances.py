@@ -31,6 +31,7 @@ from perception.masks.label_files import LARGEST
 from perception.masks.merging import Segmentation
 from perception.pipeline.optimise import Optimised, Run
 from perception.pipeline.photo_tasks import by_tasks, silhouettes_by_tasks, votes_by_tasks
+from perception.progress import Progress
 
 NODE_VIEWS = 3  # views of each part and group; by one crop each, some of the many look like what is not there
 
@@ -97,29 +98,20 @@ def describe(
         store_texts(described.instances, texts)
         return_free_memory()
 
-    def embedded(
-        ids: np.ndarray, seen: list[Silhouettes], best: int, zooms: int, read: bool = True
-    ) -> dict[str, np.ndarray]:
-        """Language arrays of all instances (eq. 11) from their `best` views (eq. 10), `zooms` crops of each; if not
-        `read`, without embeddings."""
-        if encoder is None:
-            return {}
-        choices, names = _best_views(ids, seen, best), [view.name for view in views]
-        zooms = zooms or reading_of(encoder).zooms
-        reads = encoder if read else Unread(encoder.dim)
-        shown = describe_instances(reads, choices, lambda n: _shown(views[n], seen[n]), names, zooms, progress)
-        return to_arrays(shown, encoder.identity)
-
+    zooms = language.zooms or (0 if encoder is None else reading_of(encoder).zooms)
+    embedded, node_views = partial(_embedded, views, progress), min(NODE_VIEWS, language.views)
     if grouped.count:
-        described.language = embedded(grouped.ids, seen, language.views, language.zooms)
-    nodes = min(NODE_VIEWS, language.views)
+        described.language = embedded(grouped.ids, seen, language.views, zooms, encoder)
     if grouped.parents:
-        wholes = encoder is not None and reading_of(encoder).wholes  # then only `upgrade` needs their views
-        arrays = embedded(part, parts_seen, *((1, 1, False) if wholes else (nodes, language.zooms)))
-        described.parts = {"ids": grouped.part_ids, **prefixed(arrays)}
+        described.parts = {"ids": grouped.part_ids}
+        if encoder is not None and reading_of(encoder).wholes:  # then only `upgrade` needs their views
+            arrays = embedded(part, parts_seen, 1, 1, Unread(encoder.dim, encoder.identity))
+        else:
+            arrays = embedded(part, parts_seen, node_views, zooms, encoder)
+        described.parts |= prefixed(arrays)
     if len(grouped.group_scores):
-        arrays = prefixed(embedded(levels[2], groups_seen, nodes, language.zooms))
-        described.groups = {"of": group_of[:-1], "scores": grouped.group_scores, **arrays}
+        arrays = embedded(levels[2], groups_seen, node_views, zooms, encoder)
+        described.groups = {"of": group_of[:-1], "scores": grouped.group_scores, **prefixed(arrays)}
     described.report = {
         "count": grouped.count,
         "parts": len(grouped.parents),
@@ -129,6 +121,24 @@ def describe(
         **({} if reader is None else {"texts": reader.identity}),
     }
     return described
+
+
+def _embedded(
+    views: list[TrainingView],
+    progress: Progress,
+    ids: np.ndarray,
+    seen: list[Silhouettes],
+    best: int,
+    zooms: int,
+    encoder: Encoder | Unread | None,
+) -> dict[str, np.ndarray]:
+    """Language arrays of the instances ids [N] (eq. 11) from their `best` views (eq. 10), `zooms` crops of each; {}
+    without an encoder."""
+    if encoder is None:
+        return {}
+    choices, names = _best_views(ids, seen, best), [view.name for view in views]
+    shown = describe_instances(encoder, choices, lambda n: _shown(views[n], seen[n]), names, zooms, progress)
+    return to_arrays(shown, encoder.identity)
 
 
 def _silhouettes(optimised: Optimised, levels: list[np.ndarray], run: Run) -> list[list[Silhouettes]]:

@@ -1,7 +1,7 @@
-"""Places of a photo between which its matches leave the choice, and those that the photos refute.
+"""Poses of a photo between which its matches leave the choice, and those that the photos refute.
 
-Where parts of a scene repeat, e.g. opposite walls, some matches put a photo in one place and others in another, and the
-wrong ones may be more. What does not repeat looks alike in the right place only.
+Where parts of a scene repeat, e.g. opposite walls, some matches give a photo one pose and others another, and the
+wrong ones may be more. What does not repeat looks alike at the right pose only.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from perception.sfm.database import FeatureStore, verified_matches
 from perception.sfm.pairs import stored_features
 
 POINTS, FEWEST, ALONE = 30, 5, 8
-"""Least number of points of a model by which a photo is placed, and by which a pair says anything; partners whose
-points are tried alone."""
+"""Least number of points of a model by which a photo is posed, and by which a pair counts; partners whose points are
+tried alone."""
 HALF, ALIKE = 0.5, 0.75
-"""Least share of a pair's points that agree with a place, and least likeness where the model has a photo; and where it
-is new. Right places read 0.5 to 1.9, wrong ones up to 0.7."""
+"""Least share of a pair's points that agree with a pose, and least likeness where the model has a photo; and where it
+is new. Right poses read 0.5 to 1.9, wrong ones up to 0.7."""
 Pairs = set[tuple[int, int]]
 Links = dict[int, tuple[np.ndarray, np.ndarray]]
 """By partner: pixels [N, 2] of a photo's features that match the partner's, and the ids [N] of the partner's points."""
 
 
 def settled(model: Any, store: FeatureStore, known: Pairs, seed: int) -> tuple[Any, Pairs]:
-    """A model without points of new photos, each where it looks clearly more like those of a pycolmap model than in its
-    other places; and the verified pairs that put these or the model's own photos in such others.
-    known: pairs that do. They propose no places, but what they match tells nothing, either."""
+    """A model without points of new photos, each where it looks clearly more like those of a pycolmap model than at its
+    other poses; and the verified pairs that put these or the model's own photos at such others.
+    known: pairs that do. They propose no poses, and what they match is not compared, either."""
     pycolmap = load_pycolmap()
     links, every, pairs = _links(model, store), set(model.reg_image_ids()), Pairs()
     placed, looks = pycolmap.Reconstruction(), Looks.of(model, store.image_root, every)
@@ -42,7 +42,7 @@ def settled(model: Any, store: FeatureStore, known: Pairs, seed: int) -> tuple[A
     for image, mine in sorted(links.items()):
         proposed = {i: each for i, each in mine.items() if (min(i, image), max(i, image)) not in known}
         camera, own = cameras[images[image].camera_id], [looks.photos[image]] if image in every else []
-        found = [*own, *_places(camera, proposed, own, looks.xyz, seed)]
+        found = [*own, *_poses(camera, proposed, own, looks.xyz, seed)]
         if len(found) < 2:
             continue
         gray = own[0].gray if own else loaded(store.image_root / images[image].name)
@@ -61,7 +61,7 @@ def settled(model: Any, store: FeatureStore, known: Pairs, seed: int) -> tuple[A
 
 
 def _clear(found: list[Photo], looks: Looks, others: set[int], least: float) -> Photo | None:
-    """The place that looks clearly better than the others, if there is one and it looks right."""
+    """The pose that looks clearly better than the others, if there is one and it looks right."""
     alike = [looks.likeness([each], others) for each in found]
     best = max(range(len(found)), key=lambda k: alike[k][0] / (alike[k][1] + SURE))
     clear = all(looks_better(alike[best], each) for k, each in enumerate(alike) if k != best)
@@ -86,8 +86,8 @@ def _links(model: Any, store: FeatureStore) -> dict[int, Links]:
     return links
 
 
-def _places(camera: Any, links: Links, own: list[Photo], xyz: dict[int, np.ndarray], seed: int) -> list[Photo]:
-    """Where the matches of `links` put a photo besides its `own` place: that with most points, then those of partners
+def _poses(camera: Any, links: Links, own: list[Photo], xyz: dict[int, np.ndarray], seed: int) -> list[Photo]:
+    """Where the matches of `links` put a photo besides its `own` pose: that with most points, then those of partners
     that agree with none before."""
     pycolmap, found = load_pycolmap(), list[Photo]()
     known = set[int]().union(*(_agreeing(each, links, xyz) for each in own))
