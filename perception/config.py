@@ -145,7 +145,7 @@ class DensifyConfig(Settings):
         1e-4, ge=0, description="gradient of the 2D mean from which a Gaussian grows; units of half the long side"
     )
     absgrad: bool = Field(
-        True, description="that gradient is what each pixel adds by its size (AbsGS, Ye et al. 2024), not the plain sum"
+        True, description="that gradient sums absolute values over pixels (AbsGS, Ye et al. 2024), not signed ones"
     )
 
 
@@ -154,7 +154,7 @@ class LossConfig(Settings):
     variance_weight: float = Field(0.5, ge=0, le=1000, description="weight λ_var of the variance loss (eq. 13)")
     margin: float = Field(1.0, gt=0, le=1000, description="margin γ of L_neg (eq. 8), in units of ‖z‖²")
     depth_weight: float = Field(
-        0.5, ge=0, le=1000, description="weight of the loss of measured depth; 0: no depth, by stereo either"
+        0.5, ge=0, le=1000, description="weight of the loss of measured depth; 0: neither that nor depth by stereo"
     )
     start: float = Field(0.3, ge=0, le=1, description="share of the training after which features are trained")
     every: int = Field(3, ge=1, le=10**8, description="features are trained in every N-th iteration")

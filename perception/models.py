@@ -54,7 +54,7 @@ def _opened(purpose: str | None, spec: str) -> list[str]:
         return open_sam(spec).warnings
     if purpose == "clip":
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of the providers, which every file tells
+            warnings.simplefilter("ignore")  # of the providers, which every file repeats
             try:
                 ClipEncoder.from_spec(spec)
             except InputError as error:

@@ -83,10 +83,7 @@ def delete(old: Path, path: Path | None = None) -> None:
 
 @contextmanager
 def aside(
-    path: Path,
-    make: Callable[[Path], Any],
-    put: Callable[[Path, Path], Path | None],
-    discard: Discard = delete,
+    path: Path, make: Callable[[Path], Any], put: Callable[[Path, Path], Path | None], discard: Discard = delete
 ) -> Iterator[Path]:
     """Yields a locked temporary sibling of `path`. make: creates it. put: renames it to `path` once it is synced, and
     returns where a replaced folder lies then. An InputError that names the sibling names `path` instead."""

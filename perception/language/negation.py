@@ -23,10 +23,10 @@ def negation_in(text: str) -> str | None:
     """The error of a prompt that says what a thing is not or lacks, beyond its colours, None of others: to encoders
     "mug", "no mug" and "mug without a handle" are alike. Quoted texts may say so, and names of signs."""
     quoted = quoted_text(text)
-    said = rest = " ".join(text.split()) if quoted is None else quoted[0]
-    for start, end in denials(said):
+    unquoted = rest = " ".join(text.split()) if quoted is None else quoted[0]
+    for start, end in denials(unquoted):
         rest = f"{rest[:start]}{' ' * (end - start)}{rest[end:]}"
-    if not _NOT.search(rest) or head_noun(said) in _SIGNS:
+    if not _NOT.search(rest) or head_noun(unquoted) in _SIGNS:
         return None
     found = 'says what a thing is not or lacks, which is understood of colours alone ("mug that is not red")'
     return f"query: {brief(text)} {found}; ask for what it is, and quote what is printed on it"

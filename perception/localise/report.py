@@ -1,4 +1,4 @@
-"""`perception localise`: reads the photos, localises them, and tells or writes the poses."""
+"""`perception localise`: reads the photos, localises them, and prints or writes the poses."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from perception.progress import Progress
 def localise_photos(
     path: Path, sources: Sequence[Path], output: Path | None, photos: Path | None, camera: Path | None, show: Progress
 ) -> tuple[dict[str, Any], list[str]]:
-    """The facts and the lines that tell them. output: a transforms.json with the poses that were found, in the map's
+    """The facts, and the lines that say them. output: a transforms.json with the poses that were found, in the map's
     frame; none is written without a pose. photos: a folder with the map's photos; camera: of the new ones."""
     if photos is not None and not photos.is_dir():
         raise InputError(f"{photos}: is no folder; give the one that holds the map's photos")

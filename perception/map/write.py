@@ -115,11 +115,11 @@ def set_labels(path: Path, labels: dict[int, str | None]) -> dict[int, str | Non
     tidied = {i: None if label is None else tidy_label(label) for i, label in labels.items()}
     with writing(path):
         files = MapFiles(path)
-        places = {entry["id"]: n for n, entry in enumerate(files.instances)}
+        position = {entry["id"]: n for n, entry in enumerate(files.instances)}
         for instance_id, label in tidied.items():
-            if instance_id not in places:
-                raise InputError(f"{path}: has no instance {instance_id}; it has {len(places)}")
-            files.instances[places[instance_id]]["label"] = label
+            if instance_id not in position:
+                raise InputError(f"{path}: has no instance {instance_id}; it has {len(position)}")
+            files.instances[position[instance_id]]["label"] = label
         with contextlib.ExitStack() as both:  # both are written completely before the first rename
             facts = both.enter_context(atomic_file(path / FACTS, parents=False)) if "files" in files.facts else None
             aside = both.enter_context(atomic_file(path / EDITABLE, parents=False))

@@ -122,19 +122,19 @@ class Core:
                 answers.BOXES: answers.hits_detections(reply, stamp),
                 answers.MARKS: answers.hits_markers(reply, question.identity, stamp),
             }
-            told = {**answers.answer_json(reply, question.identity), "stamp": answers.stamp_json(stamp)}
+            answer = {**answers.answer_json(reply, question.identity), "stamp": answers.stamp_json(stamp)}
         except Exception as error:  # of the engine, or of a box that is none: all four messages are sent, or this
             self._send_error(error, question.request.text, question.identity)
             return
         for topic, message in parts.items():
             self._transport.publish(topic, message)
-        self._send_json(told)
+        self._send_json(answer)
 
     def _refusal(self, error: BaseException, text: str, identity: str | None) -> Message:
         """The JSON that is sent instead of an answer, which is counted."""
-        told = error_json(error)
-        self._refused[told["kind"]] += 1
-        return {"id": identity, "text": text if len(text) <= _SHOWN else text[:_SHOWN] + "…", "error": told}
+        facts = error_json(error)
+        self._refused[facts["kind"]] += 1
+        return {"id": identity, "text": text if len(text) <= _SHOWN else text[:_SHOWN] + "…", "error": facts}
 
     def _send_error(self, error: BaseException, text: str, identity: str | None) -> None:
         self._send_json({**self._refusal(error, text, identity), "stamp": answers.stamp_json(self._stamps.next())})

@@ -51,8 +51,8 @@ def lens_of(data: Any, where: object) -> Lens:
     values = _data(data, "distortion_coefficients")
     found = len(values) if isinstance(values, (list, tuple)) else -1
     if found not in _COUNTS:
-        expected, told = ", ".join(map(str, _COUNTS)), found if found >= 0 else "no list of them"
-        raise InputError(f"{where}: expected {expected} distortion_coefficients, found {told}")
+        expected, counted = ", ".join(map(str, _COUNTS)), found if found >= 0 else "no list of them"
+        raise InputError(f"{where}: expected {expected} distortion_coefficients, found {counted}")
     k = _numbers(values, found, where, "distortion_coefficients.data").tolist()
     if any(k[len(names) :]):
         known = f"the first {len(names)} coefficients of {name} may differ from 0"
@@ -72,10 +72,7 @@ def camera_info(message: Any, rectified: bool = False) -> dict[str, Any]:
 
     size, kind = (int(message.width), int(message.height)), str(message.distortion_model) or "plumb_bob"
     K, P, distortion = field("k"), field("p"), field("d")
-    roi, binned = (
-        getattr(message, "roi", None),
-        getattr(message, "binning_x", 0) > 1,
-    )  # stated as a region, too
+    roi, binned = getattr(message, "roi", None), getattr(message, "binning_x", 0) > 1  # stated as a region, too
     if roi is not None and not binned and roi.width and roi.height and (roi.width, roi.height) != size:
         size, x, y = (int(roi.width), int(roi.height)), roi.x_offset, roi.y_offset
         K = np.subtract(K, [0, 0, x, 0, 0, y, 0, 0, 0]).tolist()

@@ -181,7 +181,7 @@ def refuse_other_frame(
 
 
 def frame_facts(info: dict[str, Any], views: Sequence[View]) -> dict[str, Any]:
-    """What map.json tells of the unit, and `frame_id`: where the map's first visit took its photos, as a hash. No
+    """What map.json records of the unit, and `frame_id`: where the map's first visit took its photos, as a hash. No
     correction, update or upgrade of a map changes it."""
     poses = [v.camera_from_world for v in views if not (isinstance(v, StoredView) and v.visit)]
     digest = hashlib.sha256(np.array(poses, np.float64).tobytes()).hexdigest()[:12]

@@ -269,7 +269,7 @@ def working(source: Path, output: Path, resume: bool) -> Iterator[Path]:
 def _forget_masks(work: Path) -> None:
     """Takes label images off the list of input files: they may be mended, as no training has used them."""
     file = work / INPUTS
-    with contextlib.suppress(OSError, ValueError, AttributeError):  # the list is damaged, as is told
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # the list is damaged: `hold_inputs` reports it
         kept = {key: files for key, files in json.loads(file.read_bytes()).items() if not key.startswith("masks=")}
         write_file(file, json.dumps(kept))
 

@@ -137,12 +137,7 @@ def _posed_scene(output: Path, run: Run, splat: SplatInput | None) -> Scene:
 
 
 def _assemble(
-    run: Run,
-    scene: Scene,
-    optimised: Optimised,
-    described: DescribedInstances,
-    output: Path,
-    splat: SplatInput | None,
+    run: Run, scene: Scene, optimised: Optimised, described: DescribedInstances, output: Path, splat: SplatInput | None
 ) -> Map:
     """The map to write, scored in its held-out views; in JSON values, None replaces NaN and infinity."""
     gaussians, quality = scored(run, optimised, scene.metric)

@@ -56,7 +56,7 @@ class Run:
 
     @classmethod
     def begun(cls, source: Path, config: MapConfig, work: Path, progress: Progress, engine: Engine = LOCAL) -> Run:
-        """A run on the device of the settings, which is told."""
+        """A run on the device of the settings, which is logged."""
         device, notice = choose_device(config.device)
         if notice is not None:
             progress.log(notice)

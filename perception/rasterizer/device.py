@@ -52,9 +52,7 @@ LISTS = structure("Lists", "ids slots starts")
 IMAGES = structure("Images", "colors alphas depths features variance visible")
 COTANGENTS = structure("Cotangents", "colors alphas depths features variance")
 GRADIENTS = structure(
-    "Gradients",
-    "means quats scales opacities colors features camera mean2d absgrad",
-    "stored fresh fresh_features",
+    "Gradients", "means quats scales opacities colors features camera mean2d absgrad", "stored fresh fresh_features"
 )
 
 

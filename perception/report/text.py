@@ -194,7 +194,7 @@ def _hit_row(rank: str, hit: Hit, metric: bool | None, names: Mapping[int, str],
 
 
 def _history(hit: Hit, metric: bool | None, names: Mapping[int, str], visits: Sequence[Visit]) -> list[str]:
-    """What the visits tell of a hit: since when it is there or gone, where it was, when it was seen last."""
+    """What the visits record of a hit: since when it is there or gone, where it was, when it was seen last."""
     since, newest, phrases = date_of(visits, hit.since or 0), len(visits) - 1, []
     if hit.state == "removed":
         phrases.append(f"gone since {since}")
@@ -234,9 +234,9 @@ def changes_parts(
     lines = []
     for state, heading in (("unseen", "not looked at"), ("unchanged", "unchanged")):
         rest = [c for c in changes if c["state"] == state]
-        told = [f"{_name(c['instance_id'], c['label'], names)} [{c['instance_id']}]" for c in rest]
+        named = [f"{_name(c['instance_id'], c['label'], names)} [{c['instance_id']}]" for c in rest]
         seen = [f", last seen {date_of(visits, c['last_seen'])}" if state == "unseen" else "" for c in rest]
-        lines += [f"{heading}: " + "; ".join(map(str.__add__, told, seen))] if rest else []
+        lines += [f"{heading}: " + "; ".join(map(str.__add__, named, seen))] if rest else []
     return title, rows, lines
 
 

@@ -101,7 +101,7 @@ class MapQueries:
     async def answer(
         self, work: Callable[[QueryMap], dict[str, Any]], map_id: str | None, at: int | None, frame: Frame | None = None
     ) -> Response:
-        """What `work` tells of the map, in `frame`, with the facts of the map and its visits."""
+        """What `work` finds of the map, in `frame`, with the facts of the map and its visits."""
 
         def answer(gmap: QueryMap) -> dict[str, Any]:
             return {**work(gmap), **source(gmap, frame), **gmap.visits_json()}

@@ -119,8 +119,8 @@ class WhatChanged(Tool):
     def fields_of(self, gmap: QueryMap, frame: Frame | None, photos: Path | None) -> dict[str, Any]:
         facts, known = gmap.changes_json("last" if self.since is None else self.since), gmap.last_known
         names = dict(zip((entry["id"] for entry in known.instances), _names(known), strict=True))
-        told = facts["changes"] if frame is None else [change_in(frame.from_map, each) for each in facts["changes"]]
-        changes = [{**change, "names": names.get(change["instance_id"], [])} for change in told]
+        moved = facts["changes"] if frame is None else [change_in(frame.from_map, each) for each in facts["changes"]]
+        changes = [{**change, "names": names.get(change["instance_id"], [])} for change in moved]
         sure = [change["confidence"] for change in changes if change["confidence"] is not None]
         return {key: facts[key] for key in ("since", "visits")} | {
             "changes": changes,

@@ -25,9 +25,9 @@ TEXTURE, CORRELATION = 6.0, 0.6
 DEGREES, BINS = 45.0, 9
 """Largest angle between the two rays to a point; bins of equal width up to it."""
 APART = 1 / 16
-"""Points so near to one that both photos match tell nothing: what repeats is matched. Share of the photo's width."""
+"""Points so near to one that both photos match are not compared: what repeats is matched. Relative to the width."""
 MOST, PAIRS = 100, 500
-"""Points compared of two photos; pairs of photos that tell how many are usually alike."""
+"""Points compared of two photos; pairs of photos in which it is counted how many usually look alike."""
 CLEARLY, SURE = 1.4, 3
 """Ratio of two likenesses that decides; points that look alike and more or fewer of which decide nothing."""
 Likeness = tuple[float, float]
@@ -91,7 +91,7 @@ class Looks:
         """[2, BINS]: points compared by the angle between the rays, and those of them that look alike."""
         found = np.zeros((2, BINS))
         for a, b in pairs:
-            degrees, alike = _compared(a, b, self._telling(a, b))
+            degrees, alike = _compared(a, b, self._unmatched(a, b))
             each = np.minimum(degrees * BINS / DEGREES, BINS - 1).astype(int)
             found += [np.bincount(each, minlength=BINS), np.bincount(each, alike, minlength=BINS)]
         return found
@@ -103,7 +103,7 @@ class Looks:
         expected = found[0] * self.usual[1] / np.maximum(self.usual[0], 1)
         return float(found[1, self.usual[0] > 0].sum()), float(expected.sum())
 
-    def _telling(self, a: Photo, b: Photo) -> np.ndarray:
+    def _unmatched(self, a: Photo, b: Photo) -> np.ndarray:
         """The points [N, 3] of a that are not matched in b, nor near those that are."""
         both, only = ([at for at in a.points if (at in b.points) == matched] for matched in (True, False))
         if both and only:

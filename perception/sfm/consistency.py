@@ -22,7 +22,7 @@ MOST_CONTRADICTED = 4
 """Pairs. Right models of up to 1,200 photos had none, two wrong ones of 1,200 photos 14 and 35 of 18,887."""
 NEAR, TURN, FEWEST = 0.1, 15.0, 5
 """Of photos at one position that look the same way: their distance relative to depth, and degrees between their axes.
-Least number of pairs that tell a fold."""
+Least number of pairs from which a fold is concluded."""
 EPIPOLAR_TOLERANCE, TOLERANCE_PIXELS = 4.0 / 1000, 4.0
 """Largest Sampson distance of a match that agrees, in normalised image coordinates; TOLERANCE_PIXELS (the error that
 verification allows) divided by the focal length where that is larger."""

@@ -130,8 +130,8 @@ def _brought(steps: list[dict[str, Any]], count: int) -> list[str]:
     if len(steps) < 2:
         return []
     gains = [(step["step"], step["registered"] - before["registered"]) for before, step in pairwise(steps)]
-    told = ", ".join(f"{name} added {gain or 'none'}" for name, gain in gains)
-    return [f"poses: {steps[0]['registered']} of {count} photos registered at once; {told}"]
+    added = ", ".join(f"{name} added {gain or 'none'}" for name, gain in gains)
+    return [f"poses: {steps[0]['registered']} of {count} photos registered at once; {added}"]
 
 
 def _report(found: Candidate, shown: list[str], seconds: dict[str, float]) -> dict[str, Any]:

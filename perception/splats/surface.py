@@ -1,4 +1,4 @@
-"""What of a finished Gaussian scene is surface: floaters and haze, told by their neighbours, are hidden."""
+"""What of a finished Gaussian scene is surface: floaters and haze, recognised by their neighbours, are hidden."""
 
 from __future__ import annotations
 

@@ -180,7 +180,7 @@ class Panel:
         self._history.content = f"*{unsaved}*" + "".join(f"  \n{escaped(what)}" for what in reversed(last))
 
     def _history_of(self, entry: dict[str, Any]) -> str:
-        """What the visits tell of an instance."""
+        """What the visits record of an instance."""
         gmap = self.session.editor.original
         visits, newest = visits_of(gmap.info, len(gmap.views)), gmap.newest_visit
         found, seen = date_of(visits, since(entry)), date_of(visits, last_seen(entry, newest))
