@@ -116,6 +116,23 @@ def test_paths_named_for_contributors_exist() -> None:
     assert missing + [path for path in named if not (ROOT / path).exists()] == []
 
 
+def heading_anchors(page: Path) -> set[str]:
+    """As GitHub names the headings of a page: small letters and hyphens, without punctuation."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.M)
+    return {re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-") for heading in headings}
+
+
+def test_links_lead_to_files_and_headings() -> None:
+    broken, count = [], 0
+    for page in [*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "tools/README.md"]:
+        for link in re.findall(r"\]\((?!http)([^)\s]+)\)", page.read_text(encoding="utf-8")):
+            file, _, anchor = link.partition("#")
+            target, count = page.parent / file if file else page, count + 1
+            if not target.exists() or (anchor and anchor not in heading_anchors(target)):
+                broken.append(f"{page.name}: {link}")
+    assert broken == [] and count > 40
+
+
 def runnable() -> list[str]:
     """The complete commands of all pages on a map of one's own: the README's walkthrough, in its order, comes first."""
     commands = [re.sub(r" MAP\b", " kitchen.gsmap", command) for _, command in documented() if "SCENE" not in command]
