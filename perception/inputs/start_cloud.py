@@ -9,7 +9,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.cloud import read_cloud
 from perception.sfm.options import Cloud
-from perception.types import Scene
+from perception.types import Scene, View
 
 GREY = 128
 FEW_SEEN = 0.01
@@ -28,17 +28,23 @@ def start_points(path: Path) -> Cloud:
     return np.asarray(cloud.points[finite], dtype=np.float64), colors[finite]
 
 
+def seen_share(views: list[View], points: np.ndarray) -> float:
+    """Share of points [P, 3], at least one, in the view of some photo; of many points every n-th is looked at."""
+    points = points[:: len(points) // LOOKED_AT or 1]
+    seen = np.zeros(len(points), bool)
+    for view in views:
+        x, y, z = view.K @ (view.camera_from_world[:3, :3] @ points.T + view.camera_from_world[:3, 3:])
+        seen |= (z > 0) & (x >= 0) & (x < view.width * z) & (y >= 0) & (y < view.height * z)
+    return float(seen.mean())
+
+
 def check_seen(scene: Scene, path: Path) -> None:
     """InputError when no view sees a point of the scene; adds a warning when few are seen. path: of the cloud, or of
     the input that brought it."""
-    points = scene.points[:: len(scene.points) // LOOKED_AT or 1]
-    seen = np.zeros(len(points), bool)
-    for view in scene.views:
-        x, y, z = view.K @ (view.camera_from_world[:3, :3] @ points.T + view.camera_from_world[:3, 3:])
-        seen |= (z > 0) & (x >= 0) & (x < view.width * z) & (y >= 0) & (y < view.height * z)
-    if not seen.any():
+    share = seen_share(scene.views, scene.points)
+    if share == 0:
         axes = "COLMAP's are camera_from_world, those of a transforms.json world_from_camera with y up and z back"
         found = f"{path}: no photo sees any of its {len(scene.points)} points"
         raise InputError(f"{found}; expected points and poses in one frame and unit ({axes})")
-    if seen.mean() < FEW_SEEN:
-        scene.report["warnings"].append(f"{path}: only {seen.mean():.2%} of its points lie in the view of some photo")
+    if share < FEW_SEEN:
+        scene.report["warnings"].append(f"{path}: only {share:.2%} of its points lie in the view of some photo")

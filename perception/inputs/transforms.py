@@ -15,7 +15,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
-from perception.inputs.start_cloud import start_points
+from perception.inputs.start_cloud import FEW_SEEN, seen_share, start_points
 from perception.io.documents import brief, read_json, refusing, safe_name
 from perception.photos.decode import SUFFIXES, photo_size, why_left_out
 from perception.photos.ignore_masks import mask_of
@@ -62,6 +62,9 @@ def read_transforms(source: Path, options: ReadOptions) -> Scene:
     if listed is None and data.get("ply_file_path"):
         listed = start_points(listing.needed(file, "ply_file_path", data["ply_file_path"]))
     views, far = without_far(views, (listed or NO_CLOUD)[0], set(), options.strict, file)
+    if options.cloud is None and listed is not None and (share := seen_share(views, listed[0])) < FEW_SEEN:
+        found = f"{share:.2%} of its points lie in the view of some photo, as if it had another frame or unit"
+        notes, listed = [*notes, f"{data['ply_file_path']}: {found}; points are triangulated in its place"], None
     facts: dict[str, Any] = {
         "input": "transforms",
         "left_out": [*missing, *far],

@@ -18,11 +18,13 @@ from perception.errors import InputError
 from perception.gaussians.photos import split_scene
 from perception.inputs.load import input_files, load_scene, photo_sizes
 from perception.inputs.readers import other_inputs, reader_of
+from perception.io.cloud import read_cloud, write_cloud
 from perception.masks.label_folder import LabelFolder
 from perception.photos.ignore_masks import mask_of
 from perception.photos.lens import load_pycolmap
 from perception.photos.scene_file import load_saved_scene, save_scene
 from perception.sfm.options import ReadOptions
+from perception.types import PointCloud
 from support.given_poses import CAMERA, NAMES, SIZE, check_poses, loaded, photo, transforms, workspace, write_model
 
 PLACES = [
@@ -111,6 +113,17 @@ def test_one_posed_photo_is_a_scene_of_random_points(tmp_path: Path) -> None:
     scene = loaded(tmp_path)
     check_poses(scene, [0])
     assert scene.report["points_from"] == "random" and "0 points could be triangulated" in scene.report["warnings"][-1]
+
+
+def test_a_listed_cloud_of_another_frame_is_not_used(tmp_path: Path) -> None:
+    """Exports of other programs give points that were not moved with the cameras."""
+    data = transforms(tmp_path)
+    cloud = read_cloud(tmp_path / data["ply_file_path"])
+    write_cloud(tmp_path / data["ply_file_path"], PointCloud(cloud.points + 1e4, cloud.colors))
+    scene = loaded(tmp_path)
+    check_poses(scene)
+    told = f"{data['ply_file_path']}: 0.00% of its points lie in the view of some photo"
+    assert any(told in each for each in scene.report["warnings"]) and scene.points.max() < 1e3
 
 
 def test_nerfstudios_lists_are_the_held_out_set(tmp_path: Path) -> None:
