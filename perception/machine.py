@@ -25,18 +25,16 @@ MOST_THREADS = 8
 """Photos that are worked on at a time; each takes tens of megabytes, and Python's own steps take turns anyway."""
 LEAST_DISK = 256 << 20
 """Least free disk space in bytes, as a small run needs it for features, masks, checkpoint and map."""
-PHOTO_DISK = 1 << 20
-"""Bytes of a photo's features and matches there: .3 and .4 MiB at 640 × 480 and 540 × 960 pixels, more if left out."""
 _CGROUPS, _OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 _blas_lock, _blas_limit, _blas_blocks = threading.Lock(), contextlib.ExitStack(), list[None]()
 threads_before: ContextVar[int] = ContextVar("threads_before", default=0)
 """Threads that torch had outside `torch_on_one_thread`; 0 outside of it."""
 
 
-def refuse_full_disk(folder: Path, photos: int = 0) -> None:
-    """InputError where the disk that holds a folder has less than LEAST_DISK free, and PHOTO_DISK for each photo whose
-    features are to be found: libraries that write them there abort the process when it becomes full."""
-    least = LEAST_DISK + photos * PHOTO_DISK
+def refuse_full_disk(folder: Path, needed: int = 0) -> None:
+    """InputError where the disk that holds a folder has less than LEAST_DISK free, and the `needed` bytes beside it:
+    libraries that write there abort the process when it becomes full."""
+    least = LEAST_DISK + needed
     if (free := shutil.disk_usage(folder).free) < least:
         found = f"its disk has {free >> 20} MiB free, at least {least >> 20} are needed"
         raise InputError(f"{folder}: {found}; free some")

@@ -190,9 +190,9 @@ def test_a_full_disk_is_told_by_the_number_of_photos(tmp_path: Path, monkeypatch
     """COLMAP aborts the process where it cannot write."""
     refuse_full_disk(tmp_path)
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=300 << 20))
-    refuse_full_disk(tmp_path, 40)
+    refuse_full_disk(tmp_path, 40 << 20)
     with pytest.raises(ValueError, match="has 300 MiB free, at least 1256 are needed"):
-        refuse_full_disk(tmp_path, 1000)
+        refuse_full_disk(tmp_path, 1000 << 20)
 
 
 @pytest.mark.parametrize(

@@ -160,7 +160,7 @@ def _planes(points: np.ndarray, down: np.ndarray, near: float, seed: int) -> tup
         if mine.sum() < max(least, 30):
             break
         around = np.abs((rest - middle) @ axes[2]) < 2 * THICKNESS * extent
-        # Over all points that are left, not over its own: a plane of few of them counts as narrower. CLUTTER is for that.
+        # Over all points that are left, not its own: a plane of few of them counts as narrower. CLUTTER is for that.
         _, width, deviation = singular / np.sqrt(len(rest))
         width = max(width, 1e-12)
         # slope of a line fitted to N points of deviation s over a width e: s / (e √N); errors of neighbours correlate

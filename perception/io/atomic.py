@@ -109,13 +109,22 @@ def aside(
         if str(temporary) not in str(error):
             raise
         raise InputError(str(error).replace(str(temporary), str(path))) from error
-    except OSError as error:
-        short = error.errno is None and str(error).endswith(" written")  # numpy's only sign of a full disk
-        if error.errno in _FULL or short:
+    except Exception as error:
+        if _is_full(error):
             raise InputError(f"{path}: the disk is full, nothing was written; free some space") from error
+        if not isinstance(error, OSError):
+            raise
         raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose another path") from error
     finally:
         discard(temporary, path)
+
+
+def _is_full(error: Exception) -> bool:
+    """Whether the disk is full. NumPy and SQLite, also in COLMAP, say so in words alone."""
+    words = str(error).rstrip()
+    if isinstance(error, OSError):
+        return error.errno in _FULL or (error.errno is None and words.endswith(" written"))
+    return words.endswith("disk is full")
 
 
 def pointed(path: Path) -> Path:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from perception.io.atomic import atomic_directory, recover
+from perception.machine import refuse_full_disk
 from perception.photos.ignore_masks import stage_masks
 from perception.photos.lens import load_pycolmap
 from perception.sfm import features, pairs
@@ -25,6 +26,9 @@ from perception.types import Lens
 
 POSED_PARTNERS = 12
 """With given poses no model has to be found: each photo is matched with this many photos at most, the best pairs."""
+
+PHOTO_DISK = 1 << 20
+"""Bytes of a photo's features and matches there: .3 and .4 MiB at 640 × 480 and 540 × 960 pixels, more if left out."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,7 @@ def build_features(
     lenses: known intrinsics per photo, or None to let structure from motion find them. Photos share one camera when
     size, EXIF camera and known lens agree. masks: of pixels without features, per photo (see `ignore_masks`).
     posed: the poses are known, so fewer pairs are matched (POSED_PARTNERS). as_stored: see `stage_photos`.
+    InputError where the disk has not PHOTO_DISK for each photo.
     """
     seed, progress, local = options.seed, options.progress, options.engine.kind == "local"
     masks = masks if masks and any(masks) else None
@@ -84,6 +89,7 @@ def build_features(
     recover(folder)
     if not (folder / "facts.json").exists():
         with atomic_directory(folder) as new:
+            refuse_full_disk(new, PHOTO_DISK * len(photos))
             load_pycolmap().set_random_seed(seed)
             started = time.perf_counter()
             names = stage_photos(new / "photos", photos, progress, as_stored)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from perception.machine import cores
+from perception.machine import cores, refuse_full_disk
 from perception.photos.ignore_masks import stage_masks
 from perception.photos.lens import load_pycolmap
 from perception.progress import Progress
@@ -76,6 +76,7 @@ class FeatureTasks:
             if size >= len(chosen):
                 match(database, chosen, seed, self.progress)
                 return
+            refuse_full_disk(self.folder.parent, cores() * database.stat().st_size)  # of which each task has a copy
         for first in range(0, len(chosen), size):
             some = chosen[first : first + size]
             folders.append(self.folder / f"pairs-{first}-{size}")

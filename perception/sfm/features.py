@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from perception.machine import refuse_full_disk
 from perception.photos.decode import CAMERA_FOLDER, exif_of, open_photo, photo_size
 from perception.photos.lens import load_pycolmap
 from perception.progress import Progress
@@ -26,8 +27,8 @@ FOCAL_LENGTHS, USUAL = (0.22, 10.0), 1.2
 lens gives 0, some phones their true millimetres. The share where EXIF says nothing, as COLMAP's."""
 _FULL_SIZE = (0xA002, 0xA003)
 """EXIF tags: width and height of the photo when it was taken, in pixels."""
-PAIRS_AT_ONCE = 2000
-"""Pairs between two steps of the progress bar."""
+PHOTOS_AT_ONCE, PAIRS_AT_ONCE = 64, 2000
+"""Photos and pairs between two steps of the progress bar, at which the disk is looked at, too."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,9 @@ def extract(database: Path, root: Path, groups: list[Group], progress: Progress,
     """Extracts the features of imported photos."""
     pycolmap = load_pycolmap()
     done, count = 0, sum(len(names) for names, _ in groups)
-    for names, reader in groups:
+    parts = [(names[n : n + PHOTOS_AT_ONCE], of) for names, of in groups for n in range(0, len(names), PHOTOS_AT_ONCE)]
+    for names, reader in parts:
+        refuse_full_disk(database.parent)
         options = pycolmap.FeatureExtractionOptions()
         options.use_gpu = False
         options.max_image_size = MAX_IMAGE_SIDE
@@ -170,6 +173,7 @@ def match(
     listed.match_list_path = database.with_name("pairs.txt")
     for first in range(0, len(chosen), PAIRS_AT_ONCE):
         some = chosen[first : first + PAIRS_AT_ONCE]
+        refuse_full_disk(database.parent)
         listed.match_list_path.write_text("".join(f"{one} {other}\n" for one, other in some))
         pycolmap.match_image_pairs(database, matching, listed, verification)
         pycolmap.verify_matches(database, listed.match_list_path, verification)

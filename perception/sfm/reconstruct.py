@@ -18,7 +18,6 @@ from typing import Any
 
 from perception.errors import InputError
 from perception.io.atomic import atomic_directory, recover
-from perception.machine import refuse_full_disk
 from perception.photos.decode import photo_size
 from perception.photos.folder import PhotoSet, choose_photos
 from perception.photos.ignore_masks import mask_of
@@ -55,7 +54,6 @@ def reconstruct(folder: Path, options: ReadOptions) -> Scene:
         if lens and photo_size(photo) != (lens.width, lens.height):
             found = "×".join(map(str, photo_size(photo)))
             raise InputError(f"{photo}: the photo is {found}, the camera file says {lens.width}×{lens.height}")
-    refuse_full_disk(options.workdir, len(photos))
     own = [mask_of(options.masks, name) for name in chosen.names]
     still = with_still(photos, list(map(photo_size, photos)), own, options.still_folder(own), options.progress)
     store = build_features(photos, [lens] * len(photos), options, still.masks)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -168,7 +169,9 @@ def run_in_processes(task: Callable[[str], Any], items: Sequence[str], what: str
             raise RuntimeError(said)
         if child.returncode:  # 1: of an InputError, whose line is the last
             told = said.rpartition("\n")[2] if child.returncode == 1 else ""
-            raise InputError(told or f"{what}: a process ended with code {child.returncode}; is memory short?")
+            why = re.search(r"what\(\): *(.*)", said)  # of a library in C++
+            advice = f" ({why[1]})" if why else "; is memory short?"
+            raise InputError(told or f"{what}: a process ended with code {child.returncode}{advice}")
 
     with ThreadPoolExecutor(cores()) as pool:
         submitted = [pool.submit(run, item) for item in items]

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import sqlite3
 import threading
 
 import cv2
@@ -325,6 +326,9 @@ def test_atomic_writes_leave_old_or_new(tmp_path):
     with pytest.raises(InputError, match="disk is full"), atomic_file(tmp_path / "f") as new:
         new.write_text("x")
         raise OSError(errno.ENOSPC, "No space left on device")
+    for library in (sqlite3.OperationalError, RuntimeError):  # pycolmap's
+        with pytest.raises(InputError, match=r"f: the disk is full"), atomic_directory(tmp_path / "f"):
+            raise library("database or disk is full")
     with atomic_directory(target) as new:
         (new / "a").write_text("new")
     assert (target / "a").read_text() == "new"

@@ -6,6 +6,7 @@ import os
 import sqlite3
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -15,7 +16,7 @@ import pytest
 pytest.importorskip("pycolmap")
 from perception.errors import InputError
 from perception.progress import QUIET
-from perception.sfm import feature_tasks
+from perception.sfm import feature_tasks, features
 from perception.sfm.database import build_features
 from perception.sfm.options import ReadOptions
 from perception.tasks import engine as engines
@@ -63,6 +64,20 @@ def test_the_database_is_that_of_one_process(
     assert rows(there.database) == wanted
     assert engine.asked == [4, -(-there.facts["pairs_matched"] // 11)]
     assert [path.name for path in (tmp_path / "there").iterdir()] == [there.folder.name]  # no task is left
+
+
+def test_a_disk_that_fills_is_told_between_few_photos_which_change_no_bit(
+    photos: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, looks = [], iter([10, 10, 10, 0])  # before, and at each of six sets of photos
+    for few in (features.PHOTOS_AT_ONCE, 2):
+        monkeypatch.setattr(features, "PHOTOS_AT_ONCE", few)
+        found.append(rows(build_features(photos[:9], [None] * 9, ReadOptions(tmp_path / str(few), 3)).database))
+    assert found[0] == found[1] and len(found[0]["keypoints"]) == 9
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=next(looks) << 30))
+    with pytest.raises(InputError, match=r"^\S+: its disk has 0 MiB free, at least 256 are needed; free some$"):
+        build_features(photos[:9], [None] * 9, ReadOptions(tmp_path / "full", 3))
+    assert not any((tmp_path / "full").iterdir())
 
 
 @pytest.mark.slow

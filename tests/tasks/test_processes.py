@@ -18,6 +18,10 @@ def task(item):
     print("a warning of a library", file=sys.stderr, flush=True)
     if item == "killed":
         os.kill(os.getpid(), signal.SIGKILL)
+    if item == "full":
+        print("terminate called\\n  what():  [a.cc:1] SQLite error: database or disk is full", file=sys.stderr)
+        sys.stderr.flush()
+        os.abort()
     if item == "refused":
         from perception.errors import InputError
         raise InputError("a.jpg: is damaged")
@@ -25,7 +29,14 @@ def task(item):
 """
 
 
-@pytest.mark.parametrize(("item", "told"), [("killed", "ended with code -9"), ("refused", r"^a\.jpg: is damaged$")])
+@pytest.mark.parametrize(
+    ("item", "told"),
+    [
+        ("killed", "ended with code -9; is memory short"),
+        ("full", r"code -6 \(\[a\.cc:1\] SQLite error: database or disk is full\)$"),
+        ("refused", r"^a\.jpg: is damaged$"),
+    ],
+)
 def test_warnings_of_libraries_hide_no_error(
     item: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
