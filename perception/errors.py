@@ -34,6 +34,10 @@ class InputError(ValueError):
         super().__init__(visible(str(message)))
 
 
+class FullDisk(InputError):
+    """A disk is full, or has less space than what is to be written may need."""
+
+
 def shell_word(path: Path | str) -> str:
     """A path in a command that people copy: one word of a shell, and no option."""
     return shlex.quote(f"./{path}" if str(path).startswith("-") else str(path))

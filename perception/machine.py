@@ -17,7 +17,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import TypeVar
 
-from perception.errors import InputError
+from perception.errors import FullDisk, InputError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -32,12 +32,12 @@ threads_before: ContextVar[int] = ContextVar("threads_before", default=0)
 
 
 def refuse_full_disk(folder: Path, needed: int = 0) -> None:
-    """InputError where the disk that holds a folder has less than LEAST_DISK free, and the `needed` bytes beside it:
+    """FullDisk where the disk that holds a folder has less than LEAST_DISK free, and the `needed` bytes beside it:
     libraries that write there abort the process when it becomes full."""
     least = LEAST_DISK + needed
     if (free := shutil.disk_usage(folder).free) < least:
         found = f"its disk has {free >> 20} MiB free, at least {least >> 20} are needed"
-        raise InputError(f"{folder}: {found}; free some")
+        raise FullDisk(f"{folder}: {found}; free some")
 
 
 def cores() -> int:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import importlib.util
 import os
+import sqlite3
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,13 +16,14 @@ import pytest
 from PIL import Image
 
 from perception.cli import main
-from perception.errors import InputError
+from perception.errors import FullDisk, InputError
 from perception.inputs.load import load_scene
 from perception.machine import refuse_full_disk
 from perception.map.outputs import refuse_inputs
 from perception.map.replace import writing
 from perception.map.write import read_map, write_map
 from perception.pipeline.checkpoint import work_folder, working
+from perception.sfm.incremental import write_models
 from perception.sfm.options import ReadOptions
 from support.given_poses import NAMES, photo, write_model
 from support.viewer_maps import small_map
@@ -184,6 +187,31 @@ def test_poses_that_were_found_outlive_an_error_after_them(tmp_path: Path) -> No
 
 def test_a_map_is_no_photos(gmap: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert f"{gmap}: is a map; give a folder of photos" in told(capsys, "map", gmap, "-o", tmp_path / "m.gsmap")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        FullDisk("a: the disk is full, nothing was written; free some space"),
+        OSError(errno.ENOSPC, "No space left on device"),
+        sqlite3.OperationalError("database or disk is full"),
+    ],
+)
+def test_work_stays_when_the_disk_is_full(error: Exception, tmp_path: Path) -> None:
+    photo(tmp_path / "photos/a.jpg")
+    told = pytest.raises(FullDisk, match=r"the disk is full.*free some space, and go on with --resume$")
+    with told, working(tmp_path / "photos", tmp_path / "a.gsmap", resume=False) as work:
+        (work / "sfm").mkdir()
+        raise error
+    assert (work / "sfm").is_dir()
+
+
+def test_a_model_is_not_written_where_the_disk_is_nearly_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """COLMAP writes files that are cut short, and says nothing."""
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1 << 20))
+    model = SimpleNamespace(write=lambda _: pytest.fail("written"))
+    with pytest.raises(FullDisk, match="has 1 MiB free, at least 256 are needed"):
+        write_models([model], tmp_path)
 
 
 def test_a_full_disk_is_told_by_the_number_of_photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 from uuid import uuid4
 
-from perception.errors import InputError
+from perception.errors import FullDisk, InputError
 
 _FULL = {errno.ENOSPC, errno.EDQUOT}
 _NO_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.EBADF, errno.EACCES}
@@ -108,10 +108,10 @@ def aside(
     except InputError as error:
         if str(temporary) not in str(error):
             raise
-        raise InputError(str(error).replace(str(temporary), str(path))) from error
+        raise type(error)(str(error).replace(str(temporary), str(path))) from error
     except Exception as error:
-        if _is_full(error):
-            raise InputError(f"{path}: the disk is full, nothing was written; free some space") from error
+        if is_full(error):
+            raise FullDisk(f"{path}: the disk is full, nothing was written; free some space") from error
         if not isinstance(error, OSError):
             raise
         raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose another path") from error
@@ -119,7 +119,7 @@ def aside(
         discard(temporary, path)
 
 
-def _is_full(error: Exception) -> bool:
+def is_full(error: Exception) -> bool:
     """Whether the disk is full. NumPy and SQLite, also in COLMAP, say so in words alone."""
     words = str(error).rstrip()
     if isinstance(error, OSError):

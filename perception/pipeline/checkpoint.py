@@ -17,7 +17,6 @@ be hours of work. With other masks (another labels:DIR), training restarts at th
 from __future__ import annotations
 
 import contextlib
-import errno
 import hashlib
 import json
 import os
@@ -31,10 +30,10 @@ from typing import Any, BinaryIO, cast
 import torch
 
 from perception.config import MapConfig
-from perception.errors import InputError
+from perception.errors import FullDisk, InputError
 from perception.gaussians.train import Trainer
 from perception.inputs.readers import EXPECTED, is_splat
-from perception.io.atomic import atomic_file, delete, write_file
+from perception.io.atomic import atomic_file, delete, is_full, write_file
 from perception.io.documents import brief, refusing
 from perception.machine import peak_memory_mib, refuse_full_disk
 from perception.map.checksums import is_map
@@ -240,7 +239,8 @@ def frames_folder(output: Path) -> Path:
 def working(source: Path, output: Path, resume: bool) -> Iterator[Path]:
     """Yields the work folder of a run that makes `output`, locked; it is deleted when the block ends without an error.
 
-    After an error it is kept for `--resume`, except for an InputError before training, unless poses were found by then.
+    After an error it is kept for `--resume`, except for an InputError before training other than FullDisk, unless poses
+    were found by then.
     InputError for a missing source, an output or unfinished run that already exists, and a full disk.
     """
     fresh, had_frames = not work_folder(output).exists(), frames_folder(output).exists()
@@ -249,10 +249,8 @@ def working(source: Path, output: Path, resume: bool) -> Iterator[Path]:
         try:
             yield work
             _remove(work)
-        except OSError as error:
-            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-                raise
-            raise InputError(f"{work}: the disk is full; free some space and go on with --resume") from error
+        except FullDisk as error:
+            raise FullDisk(f"{error}, and go on with --resume") from error
         except InputError as error:
             trained = any(work.rglob("*.pt"))  # also of a block
             if not trained and any(work.glob("sfm/**/model/report.json")):
@@ -264,6 +262,10 @@ def working(source: Path, output: Path, resume: bool) -> Iterator[Path]:
                 if not had_frames and (frames_folder(output) / FRAMES_RECORD).is_file():
                     shutil.rmtree(frames_folder(output), ignore_errors=True)
             raise
+        except Exception as error:
+            if not is_full(error):
+                raise
+            raise FullDisk(f"{work}: the disk is full; free some space, and go on with --resume") from error
 
 
 def _forget_masks(work: Path) -> None:

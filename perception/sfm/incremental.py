@@ -10,6 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from perception.machine import refuse_full_disk
 from perception.photos.lens import load_pycolmap
 from perception.progress import Progress
 from perception.sfm.consistency import Pair, is_contradicted, outvoted_photos, verified_pairs
@@ -129,7 +130,7 @@ class _Mapping:
         source = self.folder / f"start-{self.runs}"
         if start is not None:
             source.mkdir()
-            start.write(source)
+            write_model(start, source)
         out = self.folder / f"run-{self.runs}"
         out.mkdir()
         registered = 2
@@ -148,11 +149,17 @@ class _Mapping:
         return sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
 
+def write_model(model: Any, folder: Path) -> None:
+    """Writes a model into a folder. COLMAP says nothing of a disk on which it becomes full: its files are cut short."""
+    refuse_full_disk(folder)
+    model.write(folder)
+
+
 def write_models(models: list[Any], folder: Path) -> None:
     """Writes models into folders of their own in `folder`, which `read_models` reads in the same order."""
     for number, model in enumerate(models):
         (folder / f"{number:04}").mkdir()
-        model.write(folder / f"{number:04}")
+        write_model(model, folder / f"{number:04}")
 
 
 def read_models(folder: Path) -> list[Any]:

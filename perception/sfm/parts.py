@@ -21,7 +21,7 @@ from perception.progress import Progress
 from perception.sfm.alignment import Poses, moved_pose, pose_of, similarities
 from perception.sfm.database import FeatureStore
 from perception.sfm.feature_tasks import write_part
-from perception.sfm.incremental import pipeline_options
+from perception.sfm.incremental import pipeline_options, write_model
 from perception.sfm.merge import refined, triangulated
 from perception.sfm.options import ReadOptions
 from perception.sfm.partition import LARGEST, Matches
@@ -128,7 +128,7 @@ def _run(
             (folders[-1] / MODEL).mkdir(parents=True, exist_ok=True)
             if database.parent == folders[-1]:
                 write_part(store.database, images, database, ("keypoints",), matched=True)
-            _posed(model, {image: poses[image] for image in images if image in poses}).write(folders[-1] / MODEL)
+            write_model(_posed(model, {i: poses[i] for i in images if i in poses}), folders[-1] / MODEL)
             paths = {"database": str(database.resolve()), "photos": str(store.image_root.resolve())}
             write_task(folders[-1], None, adjust=what == "adjusting", seed=options.seed, **paths)
     results = run_tasks(options.engine, part_task, folders, f"poses: {what}, part", options.progress, each_core=True)
@@ -147,4 +147,4 @@ def part_task(folder: Path, facts: dict[str, Any], new: Path, progress: Progress
         model = refined(model, store, options, add=False)
     else:
         model.extract_colors_for_all_images(store.image_root)
-    model.write(new)
+    write_model(model, new)

@@ -27,7 +27,14 @@ from perception.sfm.consistency import model_warnings
 from perception.sfm.database import FeatureStore, build_features, verified_matches
 from perception.sfm.escalation import MORE, Candidate, Escalation
 from perception.sfm.features import FEW_FEATURES, camera_groups
-from perception.sfm.incremental import REPEATABLE_PHOTOS, map_photos, pipeline_options, read_models, write_models
+from perception.sfm.incremental import (
+    REPEATABLE_PHOTOS,
+    map_photos,
+    pipeline_options,
+    read_models,
+    write_model,
+    write_models,
+)
 from perception.sfm.model import cloud_of, views_of_model
 from perception.sfm.options import ReadOptions
 from perception.sfm.submodels import map_submodels
@@ -99,7 +106,7 @@ def _map(store: FeatureStore, chosen: PhotoSet, folder: Path, options: ReadOptio
         seconds |= {step["step"]: step["seconds"] for step in steps[1:]}
         report = _report(best, chosen.names, seconds) | ({"steps": steps} if steps else {})
         with atomic_directory(done) as new:
-            best.models[0].write(new)
+            write_model(best.models[0], new)
             (new / "report.json").write_text(json.dumps(report))
     for name in (AT_ONCE, MORE):
         shutil.rmtree(store.folder / name, ignore_errors=True)
