@@ -270,3 +270,10 @@ def test_without_a_folder_for_temporary_files_the_remedy_is_told(
     assert main(["localise", str(tmp_path / "a.gsmap"), str(tmp_path)]) == 2
     told = capsys.readouterr().err
     assert told.count("\n") == 1 and "No usable temporary directory" in told and "TMPDIR" in told
+
+
+def test_full_memory_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr("perception.map.files.read_info", lambda _: np.empty(1 << 60, np.uint8))
+    assert main(["info", "a.gsmap"]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("error: the memory is full") and told.count("\n") == 1 and "--max-side" in told

@@ -19,6 +19,7 @@ from typing import NoReturn
 from perception import __version__
 from perception.cli.parser import Parser
 from perception.errors import InputError
+from perception.io.documents import brief
 from perception.machine import limit_threads
 from perception.progress import mute, say
 
@@ -85,6 +86,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         say(getattr(args, "interrupted", _interrupted(argv)))
         return 130
+    except MemoryError as error:
+        todo = "use less (map: --max-side, --budget), or a machine with more; map goes on with --resume"
+        return _refused(InputError(f"the memory is full ({brief(error)}); {todo}"))
     except OSError as error:  # a path that the system refuses, wherever it is used first
         if error.filename is not None and error.strerror is not None:
             advice = "give another path, or allow access to this one"
