@@ -26,7 +26,7 @@ def read_depth(path: Path) -> np.ndarray:
     """The image [h, w] as stored, float32, 0 = nothing `measured`.
     InputError when the file is missing, damaged, empty, not of one channel, or of 8 bits: a picture of depth."""
     if not os.path.isfile(path):  # noqa: PTH113 - Path.is_file raises for a name that is too long
-        raise InputError(f"{path}: no such depth image")
+        raise InputError(f"{path}: no such depth image; add the file, or remove what lists it")
     what = "depth image; expected PNG or TIFF of one channel, or .npy"
     with refusing(f"{path}: not a readable {what}"):
         image = map_npy(path) if path.suffix.lower() == ".npy" else read_picture(path, path, what)

@@ -129,7 +129,7 @@ def test_transforms_name_depth_images_and_their_unit(keys, scale, tmp_path):
     assert view.depth == DepthImage(tmp_path / "d.png", scale)
     assert view_from_json(json.loads(json.dumps(view_json(view)))).depth == view.depth
     assert "depth" not in view_json(stored_view(view, tmp_path))  # a received map names no file that is read
-    with pytest.raises(InputError, match="does not exist"):
+    with pytest.raises(InputError, match="no such depth image; add the file"):
         read({**frame, "depth_file_path": "missing.png"})
     with pytest.raises(InputError, match="above 0"):
         read({**frame, "integer_depth_scale": 0, "depth_unit_scale_factor": 0})
