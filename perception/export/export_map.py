@@ -17,7 +17,7 @@ from perception.colors import instance_palette, rgb8_from_sh
 from perception.errors import InputError
 from perception.export.neighbors import nearest_gaussian, scattered
 from perception.export.smooth import read_segments, segment_cloud, vote
-from perception.export.spz import write_spz
+from perception.export.spz import position_bits, write_spz
 from perception.frame.recentre import map_from_input
 from perception.geometry import check_similarity, move_points, scale_of, sums_by
 from perception.io.atomic import write_file
@@ -35,6 +35,7 @@ MOST_VIEWS, LONG_SIDE = 90, 320  # views rendered for a registration, and their 
 
 SCANNET = Path("scannet")
 BESIDE = 0.1  # distance in diagonals of a map up to which a scan beside its bounds may be of its outermost things
+SPZ_ROUNDED = 2e-3  # rounding of positions in a .spz that is told, in map units
 LONE = 0.25
 """Share of a thing's spread by which a point is too far from all others to be smoothed with them."""
 
@@ -199,6 +200,9 @@ def _export_spz(map_path: Path, output: Path, points: Path | None) -> tuple[dict
     size = output.stat().st_size
     share = size / max((map_path / "gaussians.ply").stat().st_size, 1)
     text = f"{output}: {len(gmap)} Gaussians, {share:.0%} of the PLY's size; instance ids in {ids}"
+    if (rounded := 2.0 ** -(position_bits(gmap.means) + 1)) > SPZ_ROUNDED:
+        far = f"a Gaussian is {np.abs(gmap.means).max():.3g} from the origin"
+        text += f"\npositions are rounded by up to {rounded:.2g}, as {far}; a .ply holds them exactly"
     return {"spz": str(output), "gaussians": len(gmap), "bytes": size, "instance_ids": str(ids)}, text
 
 

@@ -33,6 +33,12 @@ def write_spz(path: Path, gmap: Map) -> None:
     write_file(path, data)
 
 
+def position_bits(means: np.ndarray) -> int:
+    """Bits behind the point of means [N, 3]: 12, or as many of 24 as the farthest leaves."""
+    largest = max(1.0, float(np.abs(means).max(initial=0.0)))
+    return min(12, 22 - math.ceil(math.log2(largest)))
+
+
 def spz_bytes(gmap: Map, path: Path = Path("map.spz")) -> bytes:
     """The file's bytes. InputError naming `path` where a value is not finite, or a mean beyond what 24 bits hold."""
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
@@ -42,10 +48,9 @@ def spz_bytes(gmap: Map, path: Path = Path("map.spz")) -> bytes:
             raise InputError(f"{path}: {name} of some Gaussians are not finite; upgrade or rebuild the map")
     count, degree = len(gmap), math.isqrt(gmap.sh.shape[1]) - 1
     means = gmap.means.astype(np.float64) * [1, -1, -1]
-    largest = max(1.0, float(np.abs(means).max(initial=0.0)))
-    if largest > FARTHEST:
+    if (largest := float(np.abs(means).max(initial=0.0))) > FARTHEST:
         raise InputError(f"{path}: a Gaussian lies {largest:.3g} from the origin, at most {FARTHEST} is held; use .ply")
-    bits = min(12, 22 - math.ceil(math.log2(largest)))
+    bits = position_bits(means)
     fixed = np.rint(means * 2.0**bits).astype("<i4")
     positions = np.ascontiguousarray(fixed).view(np.uint8).reshape(count, 3, 4)[:, :, :3]
     quats = gmap.quats / np.maximum(np.linalg.norm(gmap.quats, axis=1, keepdims=True), 1e-12)

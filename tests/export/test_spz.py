@@ -11,8 +11,9 @@ import torch
 
 from perception.cli import main
 from perception.errors import InputError
+from perception.export.export_map import ExportOptions, export_map
 from perception.export.spz import FLIPS, spz_bytes
-from perception.map.write import Map, read_map
+from perception.map.write import Map, read_map, write_map
 from perception.rasterizer.rasterize import rasterize
 from support.compressed import read_spz
 from support.query_maps import write_map_of
@@ -104,3 +105,16 @@ def test_opacities_of_1_and_flat_gaussians_are_written() -> None:
     gmap.log_scales[0, 2] = -np.inf
     found = read_spz(spz_bytes(gmap))
     assert found["opacities"][:2].tolist() == [1, 0] and found["log_scales"][0, 2] == -10
+
+
+@pytest.mark.parametrize(("far", "told"), [(200.0, None), (1e5, "rounded by up to 0.016")])
+def test_positions_that_a_far_gaussian_makes_coarse_are_told(far: float, told: str | None, tmp_path: Path) -> None:
+    path = write_map_of(tmp_path / "a.gsmap")
+    gmap = read_map(path)
+    gmap.means[0] = far
+    write_map(path, gmap)
+    _, text = export_map(path, tmp_path / "a.spz", None, ExportOptions())
+    assert (told or "Gaussians") in text and ("rounded" in text) == bool(told)
+    found = read_spz((tmp_path / "a.spz").read_bytes())["means"] * SHIFT
+    worst = np.abs(found - gmap.means).max()
+    assert worst <= 0.016 and (worst > 2e-3) == bool(told)
