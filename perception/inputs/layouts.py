@@ -176,7 +176,7 @@ def _seven_scenes(source: Path) -> Recording:
     frames = _posed(source, photos, lambda photo, kind: photo.with_name(f"{photo.name.partition('.')[0]}.{kind}"))
     notes = _missing(len(photos) - len(frames), len(photos), "a pose")
     for file in (folder / name for folder in (source, source.parent) for name in _SENSOR):
-        if file.is_file():
+        if file.is_file() and b"m_calibrationColor" in file.read_bytes():  # not somebody's notes
             color, own, metre = _sensor(file)
             return Recording(source, "BundleFusion / 3RScan", frames, color, metre, own, notes)
     for folder in (source, source.parent):

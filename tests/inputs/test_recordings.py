@@ -315,6 +315,13 @@ def test_a_pose_that_was_lost_as_older_visual_c_writes_it(tmp_path: Path) -> Non
     ]
 
 
+def test_notes_named_info_are_no_lenses(tmp_path: Path) -> None:
+    source = write_recording(tmp_path, "7scenes")
+    before = open_recording(source).lens
+    (source / "info.txt").write_text("taken on a rainy day\n")
+    assert open_recording(source).lens == before
+
+
 def test_scannets_choice_of_frames_has_its_intrinsics_beside_the_folders(tmp_path: Path) -> None:
     source = write_recording(tmp_path, "scannet")
     before = open_recording(source)
