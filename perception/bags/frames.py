@@ -22,6 +22,7 @@ from perception.inputs.transforms import lens_values
 from perception.io.atomic import atomic_directory
 from perception.map.outputs import check_empty
 from perception.photos.camera_file import lens_of, read_camera, write_camera
+from perception.photos.lens import resized
 from perception.photos.video import Chooser
 from perception.types import Lens
 
@@ -131,13 +132,14 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
 
 
 def _decoder(lens: Lens) -> Decoder:
-    """`decode_image` that refuses images of another size than the camera's."""
+    """`decode_image` that refuses images of another size than the camera's, but those that are binned or made smaller:
+    the lens is scaled when they are mapped."""
 
     def decode(message: Any, where: str) -> np.ndarray:
         picture = decode_image(message, where)
-        height, width = picture.shape[:2]
-        if (width, height) != (lens.width, lens.height):
-            found = f"an image is {width}x{height} pixels, the camera {lens.width}x{lens.height}"
+        size, camera = picture.shape[1::-1], (lens.width, lens.height)
+        if size != camera and not (size[0] < camera[0] and resized(camera, size)):
+            found = f"an image is {size[0]}x{size[1]} pixels, the camera {lens.width}x{lens.height}"
             raise InputError(f"{where}: {found}; give the camera_info of these images")
         return picture
 

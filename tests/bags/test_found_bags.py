@@ -20,7 +20,10 @@ from perception.bags.poses import nearest_first
 from perception.bags.read import decode_image, encoded
 from perception.cli import main
 from perception.errors import InputError
+from perception.inputs.transforms import read_transforms
 from perception.photos.camera_file import lens_of, read_camera
+from perception.photos.views import fit_lens
+from perception.sfm.options import ReadOptions
 
 pytest.importorskip("rosbags")
 from support.bag_recorder import Recorder
@@ -509,3 +512,17 @@ def test_photos_have_no_pose_while_a_clock_that_was_set_back_tells_times_twice(t
     found = {frame["stamp_ns"] // 10**9: frame["transform_matrix"][0][3] for frame in frames}
     assert found == {6: 10, 11: 90, 13: 110, 15: 130, 17: 150} and facts["chosen"] == 8
     assert "poses: none at stamps of 'cam' that came twice: its clock was set back" in text
+
+
+@pytest.mark.parametrize("posed", [True, False])
+def test_photos_that_are_binned_or_resized_have_the_camera_of_the_whole_sensor(posed: bool, tmp_path: Path) -> None:
+    """Half as large, focal lengths are halved; without poses --camera does it."""
+    record(tmp_path / "a", color=lambda bag, n, t: bag.image(COLOR, t, cv2.resize(photo(n), (48, 36))))
+    facts, _ = run_frames(tmp_path / "a", tmp_path / "out", ALL)
+    assert facts["chosen"] == COUNT
+    if posed:
+        views = read_transforms(tmp_path / "out", ReadOptions(tmp_path / "work", poses="keep", still=False)).views
+        assert len(views) == COUNT and all((v.K[0, 0], v.width, v.K[0, 2]) == (30, 48, 24) for v in views)
+    else:
+        lens = fit_lens(read_camera(tmp_path / "out" / "camera.yaml"), tmp_path / "out/images/000000.png", False)
+        assert lens is not None and (lens.params[0], lens.width) == (30, 48)
