@@ -125,7 +125,7 @@ def test_an_update_refuses_photos_too_small_to_be_scored_as_a_map_does(
     visit.mkdir()
     Image.new("RGB", (640, 64)).save(visit / "a.png")
     new = tmp_path / "new.gsmap"
-    line = told(capsys, "update", gmap, visit, "-o", new, "--max-side", 100)
+    line = told(capsys, "update", gmap, visit, "-o", new, "--max-side", 100, "--device", "cpu")
     assert "1 photos of 640×64 pixels would have a side of less than 11; give --max-side 110 or more" in line
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.gsmap", "visit"]
 

@@ -130,7 +130,9 @@ def open_session(path: Path, threads: int = 0) -> Any:
         if "NOT_IMPLEMENTED" in first:
             what = f"onnxruntime lacks a kernel for it here ({first})"
             raise InputError(f"{path}: {what}; take full precision") from error
-        if path.open("rb").read(40).startswith(b"version https://git-lfs"):
+        with path.open("rb") as file:
+            pointer = file.read(40).startswith(b"version https://git-lfs")
+        if pointer:
             raise InputError(f"{path}: a Git LFS pointer, not the model; fetch it with git lfs pull") from error
         raise InputError(f"{path}: not an ONNX model that onnxruntime can open ({first})") from error
 

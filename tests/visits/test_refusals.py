@@ -208,7 +208,8 @@ def test_a_leg_goes_on_only_from_the_gaussians_that_it_began_with(tmp_path: Path
     picture = torch.from_numpy(rng.integers(0, 255, (16, 24, 3)).astype(np.uint8))
     K = torch.tensor([[20.0, 0, 12], [0, 20, 8], [0, 0, 1]])
     view = TrainingView("a", picture, None, K, torch.eye(4))
-    config, told = load_config(pairs=["train.iterations=20", "train.exchange_db=0"]), Told()
+    # Of a torch with CUDA and no GPU, the device that is taken is told.
+    config, told = load_config(pairs=["train.iterations=20", "train.exchange_db=0", "device=cpu"]), Told()
     run, photos = Run.begun(tmp_path, config, tmp_path, told), Photos([], [], [view], [])
 
     def settled(count: int) -> Gaussians:
