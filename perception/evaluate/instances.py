@@ -199,6 +199,7 @@ def evaluated_truth(
     rules: Protocol, gt_ids: np.ndarray, ignore: np.ndarray | None = None
 ) -> tuple[np.ndarray | slice, Truth]:
     """Selection of the evaluated points, and the ground truth of these points."""
+    gt_ids = gt_ids.astype(np.int64) if gt_ids.dtype.kind == "u" else gt_ids  # −1 is given to what is ignored
     ignored = np.zeros(len(gt_ids), bool) if ignore is None else np.asarray(ignore, bool)
     if rules.remove_ignored:
         keep = (gt_ids >= -1) & ~ignored

@@ -178,6 +178,16 @@ def test_ignored_points_are_removed_by_scannetpp_and_void_elsewhere():
     assert evaluate(pred, None, gt, "scannet")["ap50"] == 0.0
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.uint32])
+def test_ignored_points_of_unsigned_truth_are_void(kind):
+    """They became an object of the greatest number, or an error (NumPy 2.5)."""
+    gt, ignore = np.repeat([1, 2], 200), np.repeat([False, True], 200)
+    pred = np.repeat([0, 1], 200)
+    for protocol in ("scannet", "mask3d", "scannetpp"):
+        assert evaluate(pred, None, gt.astype(kind), protocol, ignore) == evaluate(pred, None, gt, protocol, ignore)
+    assert evaluate(pred, None, gt.astype(kind), "scannet", ignore)["ap50"] == 1.0
+
+
 def test_confidence_order_matters_and_segment3d_drops_it():
     gt = np.repeat([1, 2, 3], 200)
     pred = np.repeat([0, 1, 2, 3, 4, 5], 100)  # halves: IoU .5 each, none above
