@@ -26,7 +26,7 @@ class RasterizationStats:
     """Per-Gaussian values for densification, in pixels, and the cost of the call.
 
     radii: [C, N] three standard deviations along the long axis of the 2D Gaussian, 0 where it is not in view.
-    mean2d_grad: [C, N] norm of the loss's gradient with respect to the 2D mean; None until backward has run, and
+    mean2d_grad: [C, N] norm of the gradient of the 2D mean, of the newest backward pass; None until one has run, and
         if it ran for the features alone.
     evaluated_pairs, contributing_pairs: (Gaussian, pixel) pairs over all cameras: those evaluated in SIMD
     registers (more on wider registers), and those that contributed colour. Speed is reported in the latter. CUDA: 0.
