@@ -29,8 +29,9 @@ CLOSELY = 0.25
 within this share of the tolerance: a distortion that is left out moves most features by less than the tolerance."""
 
 CROPPED = 1.5
-"""A photo is taken as cropped if with another principal point more features agree, and more of them closely, by this
-many roots of their number: of crops by 15 % of a side or more 1.9 to 28, of whole photos and flat things up to 1.3."""
+"""A photo is taken as cropped if with another principal point no fewer features agree, and more of them closely, by
+this many roots of their number: of crops by 15 % of a side or more 1.9 to 28, of whole photos and flat things up to
+1.3."""
 STEPS = 8
 """Most steps towards it: each lets further features agree, which the next one is estimated from."""
 _PINHOLE = (
@@ -111,8 +112,7 @@ def _recentred(matched: Matched, used: np.ndarray, pose: Pose) -> Pose:
         if further is None or (further.count, further.close) <= (moved.count, moved.close):
             break
         moved = further
-    clear = moved.count > pose.count and moved.close >= pose.close + CROPPED * np.sqrt(pose.close)
-    return moved if clear else pose
+    return moved if moved.close >= pose.close + CROPPED * np.sqrt(pose.close) else pose
 
 
 def _with_centre(matched: Matched, used: np.ndarray, lens: Lens) -> Lens | None:
