@@ -18,12 +18,12 @@ import numpy as np
 import torch
 
 from perception.changes.colours import LOOKS, LUMA, colour_odds
-from perception.changes.evidence import WEIGHTS, Signs, signs_from, sums_in
+from perception.changes.evidence import HIDDEN, WEIGHTS, Signs, signs_from, sums_in
 from perception.changes.look import Look, blurred, projected
 from perception.changes.registration import BEST, TURNED, YAWS, Points, angle_between, looks_round, register, turns
 from perception.gaussians.model import Gaussians
 from perception.gaussians.views import TrainingView, expected_depth, render
-from perception.geometry import inverse_se3, transform
+from perception.geometry import inverse_se3, move_points, transform
 from perception.rasterizer.rasterize import rasterizer_for
 from perception.rasterizer.types import Settings
 
@@ -237,6 +237,17 @@ def motion_between(
     if found[0][0].same + LOOKS[0] * (alike - LOOKS[1]) < HOPELESS:
         return None
     return settled(old, found, cuts, up, depth, alike, seen)
+
+
+def stands_after(old: Gaussians, pose: np.ndarray, frames: Sequence[Frame], scene: Gaussians, depth: float) -> float:
+    """Log-odds that photos show an old thing after a motion [4, 4], whatever outlines masks give it. scene, depth:
+    see `motion_between`."""
+    cuts = cuts_of(frames, move_points(pose, Points.of(old).points), scene)
+    shown, within = np.sum([cut.within(old, pose, depth) for cut in cuts], axis=0) if cuts else (0, 0)
+    if not cuts or within > WITHIN * shown:
+        return HIDDEN
+    signs = judged(old, [pose], cuts, depth)[0][0]
+    return replace(signs, outline=np.nan).alike if signs.photos else HIDDEN
 
 
 def likeliest(old: Gaussians, a: Points, b: Points, cuts: Sequence[Cut], up: np.ndarray, depth: float) -> list[Found]:

@@ -76,15 +76,15 @@ class Points:
         return Points(self.points[::every], self.colors[::every])
 
 
-def touching(things: Sequence[Points]) -> np.ndarray:
-    """[T, T] bool: which two things come as near to each other as parts of one do."""
+def touching(things: Sequence[Points], beside: float = BESIDE) -> np.ndarray:
+    """[T, T] bool: which two things come as near to each other as parts of one do, or within `beside` radii."""
     from scipy.spatial import cKDTree
 
     near = np.zeros((len(things), len(things)), bool)
     for a, b in permutations(range(len(things)), 2):
         if len(things[a].points) and len(things[b].points):
             away = cKDTree(things[a].points).query(things[b].points)[0]
-            near[a, b] = np.quantile(away, FRINGE) < BESIDE * min(things[a].radius, things[b].radius)
+            near[a, b] = np.quantile(away, FRINGE) < beside * min(things[a].radius, things[b].radius)
     return near | near.T
 
 

@@ -8,12 +8,12 @@ from typing import Any, cast
 import numpy as np
 import torch
 
-from perception.changes.motion import Motion
+from perception.changes.motion import Motion, stands_after
 from perception.changes.registration import Points, angle_between, carried, touching
 from perception.gaussians.model import Gaussians, isotropic
 from perception.gaussians.views import TrainingView, render
 from perception.progress import QUIET
-from perception.visits.pairing import _paired, moved, whole
+from perception.visits.pairing import _paired, along, moved, whole
 from perception.visits.visit import Visit
 from support.aimed import look_at
 
@@ -86,3 +86,21 @@ def test_no_part_is_in_two_pairs() -> None:
     pairs = _paired([10, 11, 12], {key: Motion(np.eye(4), value) for key, value in odds.items()}, 2)
     assert {i: j for i, (j, _) in pairs.items()} == {10: 0, 11: 0, 12: 1}
     assert [motion.ambiguous for _, motion in pairs.values()] == [False, False, True]  # others fit thing 1 better
+
+
+def test_what_was_near_a_moved_thing_moved_with_it_where_photos_show_it_there() -> None:
+    """7 was near 4 alone, and does not stand there; 9 near 4 and 5, 8 near none; 5, less sure, stands there, too."""
+    gone, near = [4, 5, 7, 8, 9], np.zeros((5, 5), bool)
+    for a, b in ((0, 1), (0, 2), (0, 4), (1, 4)):
+        near[a, b] = near[b, a] = True
+    pairs = {4: (0, Motion(TRUE, 6.0)), 5: (1, Motion(np.eye(4), 5.0))}
+    odds = {(2, True): -1.0, (4, True): 1.0, (4, False): -3.0, (1, True): 9.0}
+    found = along(gone, pairs, near, lambda a, pose: odds[a, np.array_equal(pose, TRUE)])
+    assert {i: (j, motion.odds) for i, (j, motion) in found.items()} == {5: (1, 6.0), 9: (0, 1.0)}
+    assert all(np.array_equal(motion.new_from_old, TRUE) for _, motion in found.values())
+
+
+def test_the_back_of_a_chair_stands_where_its_seat_went_and_a_lamp_does_not() -> None:
+    frames, seat = frames_of(carried(Gaussians.concatenate([SEAT, BACK]), TRUE)), carried(SEAT, TRUE)
+    assert stands_after(BACK, TRUE, frames, seat, 0.04) > 3
+    assert stands_after(LAMP, TRUE, frames, seat, 0.09) < -3
