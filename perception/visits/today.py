@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from perception.changes.colours import in_grey
-from perception.changes.evidence import GONE, Signs, in_free_space, looked_at, seen_rows, signs_of
+from perception.changes.evidence import AGREE, GONE, Signs, in_free_space, looked_at, seen_rows, signs_of
 from perception.changes.look import Look
 from perception.changes.motion import Motion
 from perception.changes.registration import REACH, Points, carried
@@ -48,8 +48,10 @@ PHOTOS, GREW = 2, 1.0
 more, errors at walls and in the air up to .6."""
 LEAST_SCORE = 0.5
 """Of a new thing: of 21 in ten made scenes none has less than .55; two of three errors in real scenes have less."""
-OUTLINED = 0.5
-"""Least IoU of a new thing with masks of the photos, relative to the median of those that stand where they stood."""
+OUTLINED, UNCOVERED = 0.5, 0.75
+"""Least IoU of a new thing with masks of the photos, relative to the median of those that stand where they stood; the
+same where it stands in place of what is gone and not in front of it, as does ground that this hid: parts of a sofa .53
+at most, a bottle that took a carton's place .99."""
 LOOKED_AT = 0.3
 """Share of a new thing's place from which earlier photos looked there: of 24 things that came in made scenes .7 and
 more."""
@@ -193,18 +195,21 @@ def _true(
     instances."""
     after = visit.looks(grown, _numbered(len(grown), things))
     looks = [replace(old, ids=new.ids) for old, new in zip(before, after, strict=True)]
-    pixels, instead = np.zeros(len(things)), np.zeros(len(things))
-    for old, new in zip(before, looks, strict=True):
-        for mask, count in ((new.ids >= 0, pixels), ((new.ids >= 0) & np.isin(old.ids, gone), instead)):
+    pixels, instead, within = np.zeros((3, len(things)))
+    for old, new in zip(before, after, strict=True):
+        own = new.ids >= 0
+        behind = (old.mapped > 0) & (new.mapped >= old.mapped * (1 - AGREE))
+        for mask, count in ((own, pixels), (own & np.isin(old.ids, gone), instead), (own & behind, within)):
             count += np.bincount(new.ids[mask], minlength=len(things))
     numbers, shares = range(len(things)), np.ones(len(things))
     signs = signs_of(looks, numbers, shares, shares * np.inf)  # what is in front of the old surface counts, too
     grew = signs_of(after, numbers, shares, shares * 0)
     usual = [each.outline for each in known if each.log_odds > 0 and np.isfinite(each.outline)]
-    least = OUTLINED * float(np.median(usual or 1.0))
+    replaces = instead > INSTEAD * pixels
+    least = float(np.median(usual or 1.0)) * np.where(replaces & (within > 0.5 * pixels), UNCOVERED, OUTLINED)
     shown = [j for j, new in enumerate(grew) if new.photos >= PHOTOS]
-    true = [j for j in shown if grew[j].alike >= GREW and not signs[j].outline < least]
-    stood = (signs[j].photos and signs[j].alike > 0 and not instead[j] > INSTEAD * pixels[j] for j in true)
+    true = [j for j in shown if grew[j].alike >= GREW and not signs[j].outline < least[j]]
+    stood = (signs[j].photos and signs[j].alike > 0 and not replaces[j] for j in true)
     surface = _rows([things[j] for j in shown if j not in true and things[j][1] >= LEAST_SCORE])
     return [things[j] for j in true], {n for n, each in enumerate(stood) if each}, surface
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -121,3 +122,20 @@ def test_what_masks_outline_is_surface_though_too_coarse_to_be_a_thing(monkeypat
     visit: Any = SimpleNamespace(looks=lambda *_: [])
     true, _, surface = today._true(visit, [], [], cast(Any, range(20)), things, [])
     assert [rows.tolist() for rows, _ in true] == [[0, 1, 2, 3, 4]] and surface.tolist() == [5, 6, 7, 8, 9]
+
+
+@pytest.mark.parametrize(("depth", "outline", "told"), [(0.9, 0.5, True), (1.0, 0.5, False), (1.0, 0.7, True)])
+def test_ground_that_a_thing_hid_asks_for_a_better_outline(
+    depth: float, outline: float, told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where a thing of id 7 is gone, which stood 1 m away, or what grew stands in front of that. Masks outline what
+    stays with an IoU of .8."""
+    view = TrainingView("a", torch.zeros(SIDE, SIDE, 3, dtype=torch.uint8), None, K, torch.eye(4))
+    zero, one = np.zeros((SIDE, SIDE)), np.ones((SIDE, SIDE))
+    before = Look(view, one, zero, np.full((SIDE, SIDE), 7), zero, zero, zero, zero)
+    after = replace(before, mapped=depth * one, ids=np.zeros((SIDE, SIDE), int))
+    stays, grew = (Signs(5, 900, 1.0, 0.9, iou, 0.1, 0.1, 0.8, 1.0, 0.9) for iou in (0.8, outline))
+    monkeypatch.setattr(today, "signs_of", lambda *_: [grew])
+    visit: Any = SimpleNamespace(looks=lambda *_: [after])
+    true, _, _ = today._true(visit, [before], [stays], cast(Any, range(9)), [(np.arange(9), 0.9)], [7])
+    assert bool(true) == told
