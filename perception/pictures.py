@@ -1,4 +1,4 @@
-"""Visualisation images: instance colours, depth, errors, outlines, rows of images. Images are [H, W, 3] uint8 RGB."""
+"""Visualisation images: instance colours, depth, errors, outlines, rows, crops. Images are [H, W, 3] uint8 RGB."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 
 from perception.colors import instance_palette
+
+MARGIN = 0.15  # margin around a bounding box that is cut out, as a share of its longer side
 
 
 def error_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -61,3 +63,17 @@ def titled_row(images: Sequence[np.ndarray], titles: Sequence[str]) -> np.ndarra
         draw.text((x + 2, gap + head // 2), title, fill=(40, 40, 40), anchor="lm", font=font)
         sheet.paste(Image.fromarray(image), (x, gap + head))
     return np.asarray(sheet)
+
+
+def cut_out(picture: np.ndarray, box: tuple[int, int, int, int], side: int) -> np.ndarray | None:
+    """The box (x0, y0, x1, y1) of a picture [H, W, 3] with a margin, longer side at most `side`; None outside of it."""
+    x0, y0, x1, y1 = box
+    margin = 2 + round(MARGIN * max(x1 - x0, y1 - y0))
+    top, left = max(0, y0 - margin), max(0, x0 - margin)
+    cut = picture[top : y1 + margin, left : x1 + margin]
+    if not cut.size:
+        return None
+    height, width = cut.shape[:2]
+    scale = min(1.0, side / max(height, width))
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    return cut if scale == 1 else np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA))

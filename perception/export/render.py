@@ -27,8 +27,7 @@ from perception.map.write import Map, read_map
 from perception.photos.decode import SUFFIXES
 from perception.photos.lens import camera_from_lens
 from perception.photos.views import make_view
-from perception.pictures import features_to_rgb
-from perception.query.crops import cut_out
+from perception.pictures import cut_out, features_to_rgb
 from perception.query.query_map import QueryMap
 from perception.types import View
 

@@ -8,16 +8,15 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from perception.errors import InputError
 from perception.map.map import MAX_SIDE, Map
 from perception.photos.view_json import StoredView, absolute, locate_photo
+from perception.pictures import cut_out
 from perception.query.query_map import QueryMap
 from perception.types import View
 
-MARGIN = 0.15  # margin around the bounding box, as a share of its longer side
 OUTSIDE = "photos outside the map's folder are not shown; --photos DIR shows those in DIR"
 """What a server answers for a map that names such photos."""
 
@@ -45,20 +44,6 @@ def best_crop(gmap: QueryMap, instance_id: int, side: int = 320, photos: Path | 
     except (InputError, OSError, ValueError, KeyError, TypeError):
         return None
     return cut_out(photo, box, side)
-
-
-def cut_out(picture: np.ndarray, box: tuple[int, int, int, int], side: int) -> np.ndarray | None:
-    """The box (x0, y0, x1, y1) of a picture [H, W, 3] with a margin, longer side at most `side`; None outside of it."""
-    x0, y0, x1, y1 = box
-    margin = 2 + round(MARGIN * max(x1 - x0, y1 - y0))
-    top, left = max(0, y0 - margin), max(0, x0 - margin)
-    cut = picture[top : y1 + margin, left : x1 + margin]
-    if not cut.size:
-        return None
-    height, width = cut.shape[:2]
-    scale = min(1.0, side / max(height, width))
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    return cut if scale == 1 else np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA))
 
 
 def readable_view(gmap: Map, view: View, photos: Path | None = None) -> View:

@@ -29,10 +29,9 @@ from perception.map.files import read_info
 from perception.map.history import stood
 from perception.map.map import MAX_SIDE, Map
 from perception.map.write import REPORT
-from perception.pictures import error_map, features_to_rgb, outline, overlay, titled_row
+from perception.pictures import cut_out, error_map, features_to_rgb, outline, overlay, titled_row
 from perception.progress import Progress
 from perception.query import Hit, QueryMap, load_map
-from perception.query.crops import cut_out
 from perception.query.hit import printed_texts
 from perception.report.text import changes_parts, depth_figures, names_of
 from perception.types import OrientedBox
