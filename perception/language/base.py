@@ -121,6 +121,20 @@ def normal_cdf(x: np.ndarray) -> np.ndarray:
 AT_ONCE = 4096
 
 
+NEAREST_NONSENSE = 5
+"""Texts without meaning over which a likeness to them is averaged, the nearest."""
+
+
+def like_nonsense(texts: np.ndarray, known: np.ndarray, nonsense: np.ndarray) -> np.ndarray:
+    """[T]: by how much texts [T, d] are more like nonsense [N, d] than any of the known texts [K, d] is, in cosine; 0
+    where N = 0. All are unit rows. Words that an encoder does not know are much alike to it, and near to few pictures,
+    which answered them."""
+    if not len(nonsense):
+        return np.zeros(len(texts))
+    likeness = [np.sort(rows @ nonsense.T, axis=1)[:, -NEAREST_NONSENSE:].mean(axis=1) for rows in (texts, known)]
+    return np.maximum(likeness[0] - likeness[1].max(), 0)
+
+
 def unit_rows(x: np.ndarray) -> np.ndarray:
     """Rows scaled to length 1, float32. Zero rows stay zero."""
     if x.ndim == 2 and len(x) > AT_ONCE:  # float64 copies of all rows of many maps would take gigabytes

@@ -25,6 +25,7 @@ Further rules:
         mean and standard deviation of cos(p, l_i) over the probes p, or over texts that encoders may not understand and
         find all alike (unread.txt), whichever of the two asks for more;   1 if the label equals the prompt
     a prompt of which the encoder knows no word (`Encoder.reads`) has z_ti = the bonuses, and is like no label
+    one that is more like letters without meaning (nonsense.txt) than any probe is has a smaller z, by how much more
     where a prompt describes a thing by a relation (`relations`) or its print, labels count only where that is true
 
 An instance answers if it scores PRESENT or more and its Φ⁻¹(score / (1 − LAPSE)) is at most BESIDE below the best:
@@ -44,7 +45,7 @@ from typing import TypeVar
 import numpy as np
 
 from perception.errors import InputError
-from perception.language.base import Encoder, Part, check_texts, normal_cdf, reading_of, unit_rows
+from perception.language.base import Encoder, Part, check_texts, like_nonsense, normal_cdf, reading_of, unit_rows
 from perception.language.colors import COLOR_WORDS, NOT, color_share, color_words, match_of_shares, without_color_words
 from perception.language.description import InstanceDescription
 from perception.language.household import household_thing, size_misfits
@@ -65,6 +66,7 @@ QUOTED_LEAST = 0.5  # factor of the score of an instance that bears nothing of t
 PRINTED_WEIGHT = 4.0  # added to z if all words of the prompt are printed on the instance
 SIZE_WEIGHT = 2.0  # subtracted from z per factor of two that a thing is too small or too large, at most twice
 THICK_WEIGHT = 1.0  # the same where it is too thick
+NONSENSE_WEIGHT = 20.0  # subtracted from z per unit of cosine by which a prompt is more like nonsense than any probe
 STUFF_WEIGHT = 2.0  # subtracted from z of a floor, wall or ceiling for a household thing
 LABEL_MARGIN = 2.0  # subtracted from z of a label, where z is the similarity of label and prompt relative to the probes
 LEAST_SPREAD = 1e-3  # of σ_tk, so that no text divides by zero
@@ -123,7 +125,9 @@ class TextEncoder:
         starts = [0, *(part.stop for part in parts)]
         self.parts = [(slice(start, part.stop), part) for start, part in zip(starts, parts, strict=False)]
         self.canonical = self.embed(self.reading.canonical)
-        self.probes = self.embed(probes())
+        known, nonsense = probes(), lines("nonsense.txt") if self.parts[0][1].references is not None else []
+        rows = self.embed([*known, *nonsense])  # at once: a long list is kept in the user's cache
+        self.probes, self._nonsense = rows[: len(known)], rows[len(known) :]
         self._usual = [float(self._spreads(self.probes, *part).mean()) for part in self.parts]
 
     def reads(self, text: str) -> bool:
@@ -174,6 +178,10 @@ class TextEncoder:
         nulls = [np.stack([fit.mean(axis=1), np.maximum(fit.std(axis=1), 1e-6)], axis=1) for fit in fits]
         known, unread = (null @ [1.0, LABEL_MARGIN] for null in nulls)
         return np.where((known >= unread)[:, None], *nulls)
+
+    def meaningless(self, texts: np.ndarray) -> np.ndarray:
+        """`like_nonsense` of text embeddings [T, D] in the first part [T]; 0 for encoders without reference words."""
+        return like_nonsense(*(unit_rows(rows[:, self.parts[0][0]]) for rows in (texts, self.probes, self._nonsense)))
 
     def _spreads(self, texts: np.ndarray, columns: slice, part: Part) -> np.ndarray:
         """σ_tk [T] of text embeddings [T, D] in one part; 1 where the encoder has no reference words for it."""
@@ -246,6 +254,7 @@ class Scorer:
         z = self._shape_bonus(text)
         if self.encoder.reads(asked):
             z = (self.encoder.relevancy(row, known.compared)[0] - middle) / spread + z + gain
+            z = z - NONSENSE_WEIGHT * self.encoder.meaningless(row)
         if usual := household_thing(text):
             length, thickness = np.nan_to_num(np.minimum(size_misfits(known.sides, usual), 2.0))
             z = z - SIZE_WEIGHT * length - THICK_WEIGHT * thickness

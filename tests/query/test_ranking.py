@@ -44,8 +44,10 @@ from perception.query.ranking import (
     TextEncoder,
     answering,
     least_score,
+    lines,
     probes,
 )
+from score.queries import ABSENT, HOUSEHOLD
 
 DIM = 24
 
@@ -208,6 +210,24 @@ def test_an_empty_map_and_unseen_instances(scene: tuple[Table, list[InstanceDesc
         rank("  ", things, encoder)
     with pytest.raises(InputError, match="embeddings have 3 dimensions"):
         rank("mug", [unseen(3)], encoder)
+
+
+def test_letters_without_meaning_are_told_from_things(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Random letters, random syllables and what people type, none of it in nonsense.txt, and things that are absent in
+    the scorer's scenes."""
+    rng, consonants = np.random.default_rng(3), "bcdfghjklmnpqrstvwxz"
+    letters = ["".join(rng.choice([*consonants, *"aeiou"], rng.integers(4, 8))) for _ in range(40)]
+    spoken = ["".join(rng.choice([*of]) for of in (consonants, "aeiou") * 3) for _ in range(40)]
+    typed = ["asdf qwer", "blorf", "xqzzt", "zorp", "sdkfjh", "florp glarb", "qwe rty", "wug"]
+    assert not set(letters + spoken + typed) & set(lines("nonsense.txt"))
+    over = conse().meaningless(conse().embed([*letters, *spoken, *typed]))
+    assert (over > 0).mean() > 0.6  # .74; others are made of syllables of real words
+    assert not conse().meaningless(conse().embed([*ABSENT, *HOUSEHOLD, *probes()])).any()
+    things = [_thing(row) for row in conse().embed(["mug", "chair", "book"])]
+    before = [rank(prompt, things, conse()) for prompt in ("zorp", "mug")]
+    monkeypatch.setattr("perception.query.ranking.NONSENSE_WEIGHT", 0.0)
+    after = [rank(prompt, things, conse()) for prompt in ("zorp", "mug")]
+    assert before[0][0][1] < after[0][0][1] and before[1] == after[1]
 
 
 def test_probes_are_many_and_unique() -> None:
