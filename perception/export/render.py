@@ -73,9 +73,9 @@ def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[st
     if mixed := {file.parent.resolve() for file in outputs} & {photo.parent.resolve() for photo in photos}:
         found = "holds photos, and a later map would be made of pictures of this one too"
         raise InputError(f"{min(mixed)}: {found}; choose another -o")
-    for file in filter(os.path.lexists, outputs):  # the user named none of them
-        if not _is_render(file):
-            raise InputError(f"{file}: lies there, and is no picture of this command; choose another -o")
+    for there in filter(os.path.lexists, outputs):  # the user named none of them
+        if not _is_render(there):
+            raise InputError(f"{there}: lies there, and is no picture of this command; choose another -o")
     gaussians = as_gaussians(gmap)
     for kind, folder in folders.items():
         for file, view in zip(files, views, strict=True):
