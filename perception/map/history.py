@@ -29,6 +29,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from itertools import product
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -40,6 +41,9 @@ from perception.io.json_shapes import Count, Matrix3, Moment, PathText, Point, P
 State = Literal["moved", "removed", "added", "unchanged", "unseen"]
 STATES = get_args(State)
 """Of an instance between two visits, in the order in which they are listed."""
+BACK = 0.05
+"""What moved more than once stands where it stood if no corner of its box is farther off than this share of the box's
+diagonal."""
 OBB = {"center": Point, "rotation": Matrix3, "extent": Sides}
 AABB = {"min": Point, "max": Point}
 VISIT = {"time": Moment | None, "input": PathText, "photos": Count}
@@ -157,12 +161,12 @@ def _change(entry: dict[str, Any], start: int, newest: int) -> dict[str, Any] | 
     if before is None and after is None:
         return None
     later = [spot for spot in entry.get("past", ()) if spot["until"] >= start]
-    seen = last_seen(entry, newest)
+    seen, motion = last_seen(entry, newest), _motion(later)
     if before is None:
         state = "added"
     elif after is None:
         state = "removed"
-    elif later:
+    elif later and not (len(later) > 1 and _is_back(entry, later, motion)):
         state = "moved"
     else:
         state = "unchanged" if seen >= min(start + 1, newest) else "unseen"
@@ -173,7 +177,7 @@ def _change(entry: dict[str, Any], start: int, newest: int) -> dict[str, Any] | 
         "confidence": entry.get("confidence"),
         "old_centroid": None if before is None else before["centroid"],
         "new_centroid": None if after is None else after["centroid"],
-        "transform": _motion(later) if state == "moved" else None,
+        "transform": motion if state == "moved" else None,
         "last_seen": seen,
     }
     if state in ("moved", "removed"):
@@ -204,6 +208,17 @@ def _motion(spots: Iterable[dict[str, Any]]) -> list[list[float]] | None:
             return None
         whole = np.array(spot["transform"], np.float64) @ whole
     return whole.tolist()
+
+
+def _is_back(entry: dict[str, Any], spots: Sequence[dict[str, Any]], motion: list[list[float]] | None) -> bool:
+    """Whether an entry stands where it stood before it moved over `spots`, as far as `motion` [4, 4] is known."""
+    if motion is None or any(spot.get("ambiguous") or "axis" in spot for spot in spots):
+        return False
+    box = entry["obb"]
+    sides = np.array(list(product((-0.5, 0.5), repeat=3))) * box["extent"]
+    corners = sides @ np.array(box["rotation"]).T + box["center"]
+    off = np.linalg.norm(move_points(np.array(motion), corners) - corners, axis=1).max()
+    return bool(off <= BACK * np.linalg.norm(box["extent"]))
 
 
 # ------------------------------------------------------------------ edits

@@ -65,13 +65,26 @@ def test_motions_of_several_visits_are_one(gmap: QueryMap) -> None:
     turn = np.array([[0.0, -1, 0, 1], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     shift = np.eye(4)
     shift[:3, 3] = [0, 2, 1]
-    from perception.map.history import changes_of
-
     lamp = next(entry for entry in gmap.instances if entry["id"] == number("lamp"))
     first = {**lamp["past"][0], "until": 0, "transform": turn.tolist()}
     second = {**lamp["past"][0], "until": 1, "transform": shift.tolist()}
     change = changes_of(gmap.visits, [{**lamp, "past": [first, second]}], 0)[0]
     assert np.allclose(change["transform"], shift @ turn)
+
+
+@pytest.mark.parametrize(("turn", "off", "state"), [(0, 0.04, "unchanged"), (0, 0.3, "moved"), (20, 0, "moved")])
+def test_what_moved_and_went_back_is_unchanged(gmap: QueryMap, turn: float, off: float, state: str) -> None:
+    lamp = next(entry for entry in gmap.instances if entry["id"] == number("lamp"))
+    box = {"center": [3.0, 0, 0], "rotation": np.eye(3).tolist(), "extent": [1.0, 1, 1]}
+    away, back = np.eye(4), np.eye(4)
+    away[:3, 3], back[:3, 3] = [0, 2, 1], [off, -2, -1]
+    c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+    about = np.array([[c, -s, 0, 3 - 3 * c], [s, c, 0, -3 * s], [0, 0, 1, 0], [0, 0, 0, 1]])  # the box's centre
+    spots = [{**lamp["past"][0], "until": n, "transform": m.tolist()} for n, m in enumerate((away, about @ back))]
+    entry = {**lamp, "obb": box, "centroid": box["center"], "past": spots}
+    assert [changes_of(gmap.visits, [entry], start)[0]["state"] for start in (0, 1)] == [state, "moved"]
+    sure = [{**spots[0], "ambiguous": True}, spots[1]]
+    assert changes_of(gmap.visits, [{**entry, "past": sure}], 0)[0]["state"] == "moved"
 
 
 def test_a_gone_thing_is_no_hit_and_is_named(gmap: QueryMap) -> None:
