@@ -27,7 +27,7 @@ def choose_device(wanted: Literal["auto", "cpu", "cuda"]) -> tuple[torch.device,
 
     InputError for "cuda" where no GPU can be used.
     """
-    if wanted == "cpu" or (wanted == "auto" and torch.version.cuda is None and not _has_driver()):
+    if wanted == "cpu" or (wanted == "auto" and not _has_driver()):
         return torch.device("cpu"), None
     try:
         name = _usable_gpu()

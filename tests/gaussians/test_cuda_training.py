@@ -251,9 +251,10 @@ def test_a_full_memory_is_met_with_fewer_records_then_refused(pretended, monkeyp
 
 
 def test_which_device_is_chosen(monkeypatch):
-    monkeypatch.setattr(torch.version, "cuda", None)
     monkeypatch.setattr(devices, "_has_driver", lambda: False)
-    assert devices.choose_device("auto") == devices.choose_device("cpu") == (torch.device("cpu"), None)
+    for build in ("12.8", None):
+        monkeypatch.setattr(torch.version, "cuda", build)
+        assert devices.choose_device("auto") == devices.choose_device("cpu") == (torch.device("cpu"), None)
     with pytest.raises(InputError, match="--device cuda: torch was built without CUDA; install it without constraints"):
         devices.choose_device("cuda")
     monkeypatch.setattr(devices, "_has_driver", lambda: True)
