@@ -212,7 +212,7 @@ def _motion(spots: Iterable[dict[str, Any]]) -> list[list[float]] | None:
 
 def _is_back(entry: dict[str, Any], spots: Sequence[dict[str, Any]], motion: list[list[float]] | None) -> bool:
     """Whether an entry stands where it stood before it moved over `spots`, as far as `motion` [4, 4] is known."""
-    if motion is None or any(spot.get("ambiguous") or "axis" in spot for spot in spots):
+    if motion is None or any(spot.get("ambiguous") for spot in spots):
         return False
     box = entry["obb"]
     sides = np.array(list(product((-0.5, 0.5), repeat=3))) * box["extent"]
