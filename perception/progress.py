@@ -21,8 +21,8 @@ def say(text: str) -> None:
 
 @contextmanager
 def outlasting(stream: TextIO) -> Iterator[None]:
-    """Around output that nobody may read any more: where its terminal or pipe is closed, or its disk full, this and all
-    later output of the stream is dropped, and the work goes on."""
+    """Lets the work go on if output within it fails, as its terminal or pipe is closed, or its disk full: this and all
+    later output of the stream is dropped."""
     try:
         yield
     except OSError:

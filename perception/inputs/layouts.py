@@ -37,16 +37,9 @@ _KINECT_DEPTH, _KINECT_COLOR = (585.0, 585.0, 320.0, 240.0), (525.0, 525.0, 320.
 _SIZE = (640, 480)
 _COMMA = re.compile(r"[+-]?\d+,\d+(e[+-]?\d+)?", re.IGNORECASE)
 _TEXTS = (
-    *(
-        "rgb.txt",
-        "depth.txt",
-        "groundtruth.txt",
-        "pose/*.txt",
-        "intrinsic/*.txt",
-        "intrinsics_*.txt",
-        "frame-*.pose.txt",
-    ),
-    *("seq*/frame-*.pose.txt", "camera-intrinsics.txt", "*info.txt", "*.log", "*intrinsic*.json", "camera*.json"),
+    *("rgb.txt", "depth.txt", "groundtruth.txt", "pose/*.txt", "intrinsic/*.txt", "intrinsics_*.txt"),
+    *("frame-*.pose.txt", "seq*/frame-*.pose.txt", "camera-intrinsics.txt", "*info.txt"),
+    *("*.log", "*intrinsic*.json", "camera*.json"),
 )
 _COLOR_FOLDERS = ("color", "image", "rgb")
 _SENSOR = ("_info.txt", "info.txt")

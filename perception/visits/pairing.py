@@ -80,8 +80,10 @@ def moved(visit: Visit, grown: Gaussians, things: list[Thing], gone: list[int]) 
 
 
 def along(gone: list[int], pairs: Pairs, near: np.ndarray, stands: Callable[[int, np.ndarray], float]) -> Pairs:
-    """Pairs of the instances `gone` that moved with one that moved more surely and was near, near [G, G] bool, as masks
-    cut the legs off a chair. stands: log-odds that photos show one, by its number, after a motion [4, 4]."""
+    """Pairs of instances that moved together with a neighbour whose motion is surer: masks may cut a chair in pieces.
+
+    gone: G instances that left. pairs: those of them that are known to have moved. near: [G, G] bool, which were
+    neighbours. stands: log-odds that photos show the a-th of `gone` after a motion [4, 4]."""
     found: Pairs = {}
     for a, i in enumerate(gone):
         own, least = pairs[i] if i in pairs else (None, Motion(np.eye(4), -np.inf))
