@@ -25,7 +25,7 @@ Further rules:
         mean and standard deviation of cos(p, l_i) over the probes p, or over texts that encoders may not understand and
         find all alike (unread.txt), whichever of the two asks for more;   1 if the label equals the prompt
     a prompt of which the encoder knows no word (`Encoder.reads`) has z_ti = the bonuses, and is like no label
-    z_ti of a prompt that is more like texts without meaning (nonsense.txt) than any probe is less NONSENSE_WEIGHT × excess
+    z_ti is less by NONSENSE_WEIGHT times what a prompt is more like texts without meaning (nonsense.txt) than any probe
     where a prompt describes a thing by a relation (`relations`) or its print, labels count only where that is true
 
 An instance answers if it scores PRESENT or more and its Φ⁻¹(score / (1 − LAPSE)) is at most BESIDE below the best:
