@@ -13,7 +13,7 @@ from perception.inputs.colmap_files import Model, names_in, read_model
 from perception.io.documents import safe_name
 from perception.photos.folder import NO_PHOTOS, folders_below, list_photos
 from perception.photos.lens import lens_from_camera
-from perception.photos.named_files import NamedFiles, parts_of
+from perception.photos.named_files import NamedFiles, leads_out, parts_of
 from perception.photos.views import first_of, without_far
 from perception.posed.triangulate import MIN_POINTS, posed_scene
 from perception.sfm.model import cloud_of, views_of_model
@@ -60,7 +60,7 @@ def model_photos(folder: Path) -> list[Path]:
         names = sorted({name for path in parts for name in names_in(path)})
     except InputError:
         return list_photos(images) if images.is_dir() else []
-    files = NamedFiles(photo_folder(folder, parts[0], names))
+    files = NamedFiles(photo_folder(folder, parts[0], names), beyond=False)
     return [path for path in map(files.find, names) if path is not None]
 
 
@@ -76,7 +76,7 @@ def photo_folder(folder: Path, model: Path, names: Sequence[str]) -> Path:
     below = sorted(folders_below(folder, DEPTH - 1), key=lambda path: bool(NO_PHOTOS.search(path.name)))
     best, most = folder / usual[0], 0
     for path in [*near, folder, *below]:
-        files = NamedFiles(path)
+        files = NamedFiles(path, beyond=False)
         held = sum(files.find(name) is not None for name in names) if path.is_dir() else 0
         if held > most:
             best, most = path, held
@@ -89,8 +89,8 @@ def photo_folder(folder: Path, model: Path, names: Sequence[str]) -> Path:
 
 def read_workspace(folder: Path, options: ReadOptions) -> Scene:
     """The preferred sparse model of a workspace as a Scene, in COLMAP's world.
-    Photos that are missing or damaged, or whose pose or camera is not finite, are left out and reported. Image names
-    that point outside the photo folder raise InputError."""
+    Photos that are missing or damaged, or whose pose or camera is not finite, are left out and reported. Of image names
+    that point outside the photo folder the longest end that is a photo in it is taken."""
     paths, (models, model) = models_below(folder), _models(folder)
     path, reconstruction = model.path, model.reconstruction
     located, wrong = _located(folder, model)
@@ -134,9 +134,17 @@ def model_frames(folder: Path) -> list[tuple[str, np.ndarray, Lens]]:
 
 
 def _models(folder: Path) -> tuple[list[Model], Model]:
-    """The models of `_preferred`, and the largest. InputError where that is empty."""
-    models = [read_model(path) for path in _preferred(folder)]
+    """The models of `_preferred` without damaged ones after the first, and the largest, with a warning for each of
+    these. InputError where that is empty, or the first is damaged."""
+    first, *others = _preferred(folder)
+    models, damaged = [read_model(first)], list[str]()
+    for path in others:
+        try:
+            models.append(read_model(path))
+        except InputError as error:
+            damaged.append(f"{error}; this model is not used")
     model = max(models, key=_registered)
+    model.warnings += damaged
     if _registered(model) == 0:
         found = "the sparse model is empty (no registered photo)"
         raise InputError(f"{model.path}: {found}; run structure from motion again")
@@ -156,11 +164,12 @@ def _preferred(folder: Path) -> list[Path]:
 
 def _located(folder: Path, model: Model) -> tuple[dict[int, tuple[str, Path]], list[dict[str, str]]]:
     """View name and photo by image id, and the images that are wrong."""
-    names = {number: safe_name(model.names[number], model.path) for number in model.reconstruction.reg_image_ids()}
-    root = photo_folder(folder, model.path, list(names.values()))
-    files, located, taken = NamedFiles(root), {}, set[Path]()
+    written = {number: model.names[number] for number in model.reconstruction.reg_image_ids()}
+    names = {number: safe_name(_below(name), model.path) for number, name in written.items()}
+    root = photo_folder(folder, model.path, list(written.values()))
+    files, located, taken = NamedFiles(root, beyond=False), {}, set[Path]()
     for image_id, name in sorted(names.items(), key=lambda item: (not (root / item[1]).is_file(), item[0])):
-        photo = files.find(name)
+        photo = files.find(written[image_id])
         if photo is None or photo in taken:  # another image has that very name
             photo = root / "/".join(parts_of(name))
         if photo in taken:
@@ -171,6 +180,12 @@ def _located(folder: Path, model: Model) -> tuple[dict[int, tuple[str, Path]], l
         {"name": located.pop(number)[0], "why": why} for number, why in sorted(model.wrong.items()) if number in located
     ]
     return located, wrong
+
+
+def _below(name: str) -> str:
+    """A name as below its folder: of an absolute path, or one with "..", its folders and its file."""
+    parts = parts_of(name)[":" in name[1:2] :]
+    return "/".join(part for part in parts if part != "..") if leads_out(name) else name
 
 
 def _reprojection_error(model: Any) -> float | None:

@@ -26,22 +26,31 @@ def parts_of(name: str) -> list[str]:
     return [part for part in _SEPARATOR.split(name) if part not in ("", ".")]
 
 
-class NamedFiles:
-    """The files below `folder`, by the names that lists give them. Each folder is listed once."""
+def leads_out(name: str) -> bool:
+    """Whether a name is an absolute path of any operating system, or has a part ".."."""
+    return bool(_ABSOLUTE.match(name)) or ".." in parts_of(name)
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+
+class NamedFiles:
+    """The files below `folder`, by the names that lists give them. Each folder is listed once.
+    beyond: whether an absolute path, or one with "..", may lead to a file elsewhere."""
+
+    def __init__(self, folder: Path, beyond: bool = True) -> None:
+        self.folder, self.beyond = folder, beyond
         self._listed: dict[Path, dict[str, list[str]]] = {}
 
     def find(self, name: str, suffixes: Iterable[str] = ()) -> Path | None:
         """The file `name` as it is written, else with "\\" as "/", else the only one that differs by capitals or by the
-        form of Unicode; with each of `suffixes` where it has none. Of an absolute path that leads nowhere the longest
-        end that is a file below the folder. None without a file."""
+        form of Unicode; with each of `suffixes` where it has none. Of an absolute path that leads nowhere, and of what
+        may not lead elsewhere, the longest end that is a file below the folder. None without a file."""
         endings, parts = ("", *suffixes), parts_of(name)
-        for path in (self.folder / f"{name}{end}" for end in endings):
+        outside = not self.beyond and leads_out(name)
+        for path in (self.folder / f"{name}{end}" for end in endings if not outside):
             if os.path.isfile(path):  # noqa: PTH113 - Path.is_file raises for a name that is too long
                 return path
-        starts = range(len(parts)) if _ABSOLUTE.match(name) else range(min(1, len(parts)))
+        if outside:
+            parts = [part for part in parts if part != ".."]
+        starts = range(len(parts)) if outside or _ABSOLUTE.match(name) else range(min(1, len(parts)))
         return next(filter(None, (self._below(parts[start:], endings) for start in starts)), None)
 
     def _below(self, parts: list[str], endings: tuple[str, ...]) -> Path | None:

@@ -190,6 +190,28 @@ def test_names_of_models_hold_blanks_backslashes_and_other_case(spelled: str, su
     assert [view.name for view in scene.views] == [f"cam 1/{name}" for name in NAMES]
 
 
+@pytest.mark.parametrize("spelled", ["C:\\scan\\images\\cam\\{}", "/home/me/cam/{}", "../../cam/{}", "{elsewhere}/cam/{}"])
+def test_names_of_models_that_lead_elsewhere_are_the_photos_below(spelled: str, tmp_path: Path) -> None:
+    folder = workspace(tmp_path / "in", names=[f"cam/{name}" for name in NAMES])
+    elsewhere = workspace(tmp_path / "elsewhere", names=[f"cam/{name}" for name in NAMES]) / "images"
+    write_model(folder / "sparse/0", [spelled.format(name, elsewhere=elsewhere) for name in NAMES])
+    scene = loaded(folder)
+    check_poses(scene)
+    assert [view.photo for view in scene.views] == [folder / "images/cam" / name for name in NAMES]
+
+
+def test_a_damaged_model_beside_a_good_one_is_not_used_and_named(tmp_path: Path) -> None:
+    folder = workspace(tmp_path / "in")
+    images = write_model(folder / "sparse/1", NAMES[:3]) / "images.txt"
+    images.write_text(images.read_text().replace("1 ", "x ", 1))
+    scene = loaded(folder)
+    check_poses(scene)
+    assert any(f"{images}: line" in line and "not used" in line for line in scene.report["warnings"])
+    (folder / "sparse/0").rename(folder / "sparse/2")
+    with pytest.raises(InputError, match="images.txt: line"):
+        loaded(folder)
+
+
 def test_a_photo_belongs_to_the_image_of_its_very_name(tmp_path: Path) -> None:
     folder = workspace(tmp_path / "in")
     write_model(folder / "sparse/0", ["3.PNG", *NAMES[1:]])
