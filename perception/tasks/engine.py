@@ -23,10 +23,15 @@ from perception.progress import Progress
 CONNECT = 10.0  # seconds in which a cluster must answer
 RETRIES = 5  # how often a task is run again whose worker was lost
 _TOKENS = {"RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"}
-_CHILD = """import sys
-sys.path[:] = sys.argv[4:]
+_CHILD = """import os, sys, threading, time
+sys.path[:] = sys.argv[5:]
 from importlib import import_module
 from perception.errors import InputError
+def leave():
+    while os.getppid() == int(sys.argv[4]):
+        time.sleep(0.5)
+    os._exit(1)
+threading.Thread(target=leave, daemon=True).start()
 try:
     getattr(import_module(sys.argv[1]), sys.argv[2])(sys.argv[3])
 except InputError as error:
@@ -156,12 +161,13 @@ class _Stoppable(Progress):
 
 def run_in_processes(task: Callable[[str], Any], items: Sequence[str], what: str, progress: Progress) -> None:
     """task(item) of each item, as many at a time as there are cores, each in a process of its own: for libraries that
-    threads may not share. The first error is raised and ends the others. task: a function that its module has."""
+    threads may not share. The first error is raised and ends the others; so does the end of this process, in any way.
+    task: a function that its module has."""
     command = [sys.executable, "-c", _CHILD, task.__module__, task.__name__]
     running: list[subprocess.Popen[str]] = []
 
     def run(item: str) -> None:
-        whole, quiet, heard = [*command, item, *sys.path], subprocess.DEVNULL, subprocess.PIPE
+        whole, quiet, heard = [*command, item, str(os.getpid()), *sys.path], subprocess.DEVNULL, subprocess.PIPE
         child = subprocess.Popen(whole, stdout=quiet, stderr=heard, text=True, start_new_session=True)
         running.append(child)
         said = child.communicate()[1].strip()

@@ -190,7 +190,9 @@ def test_names_of_models_hold_blanks_backslashes_and_other_case(spelled: str, su
     assert [view.name for view in scene.views] == [f"cam 1/{name}" for name in NAMES]
 
 
-@pytest.mark.parametrize("spelled", ["C:\\scan\\images\\cam\\{}", "/home/me/cam/{}", "../../cam/{}", "{elsewhere}/cam/{}"])
+@pytest.mark.parametrize(
+    "spelled", ["C:\\scan\\images\\cam\\{}", "/home/me/cam/{}", "../../cam/{}", "{elsewhere}/cam/{}"]
+)
 def test_names_of_models_that_lead_elsewhere_are_the_photos_below(spelled: str, tmp_path: Path) -> None:
     folder = workspace(tmp_path / "in", names=[f"cam/{name}" for name in NAMES])
     elsewhere = workspace(tmp_path / "elsewhere", names=[f"cam/{name}" for name in NAMES]) / "images"
@@ -208,7 +210,7 @@ def test_a_damaged_model_beside_a_good_one_is_not_used_and_named(tmp_path: Path)
     check_poses(scene)
     assert any(f"{images}: line" in line and "not used" in line for line in scene.report["warnings"])
     (folder / "sparse/0").rename(folder / "sparse/2")
-    with pytest.raises(InputError, match="images.txt: line"):
+    with pytest.raises(InputError, match=r"images.txt: line"):
         loaded(folder)
 
 

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -25,6 +32,10 @@ def task(item):
     if item == "refused":
         from perception.errors import InputError
         raise InputError("a.jpg: is damaged")
+    if item.startswith("long"):
+        import pathlib, time
+        pathlib.Path(item[5:]).write_text(str(os.getpid()))
+        time.sleep(600)
     print("Traceback of an exception that Python ignored", file=sys.stderr)
 """
 
@@ -46,3 +57,33 @@ def test_warnings_of_libraries_hide_no_error(
     with pytest.raises(InputError, match=told):
         run_in_processes(task, [item], "matching", QUIET)
     run_in_processes(task, ["done"], "matching", QUIET)
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="asks Linux which processes run")
+def test_no_process_outlives_one_that_is_killed(tmp_path: Path) -> None:
+    (tmp_path / "told_tasks.py").write_text(TASKS)
+    run = (
+        "from perception.progress import QUIET; from perception.tasks.engine import run_in_processes; import told_tasks"
+    )
+    run += f"; run_in_processes(told_tasks.task, ['long {tmp_path / 'pid'}'], 'matching', QUIET)"
+    path = os.pathsep.join([str(tmp_path), *sys.path])
+    parent = subprocess.Popen([sys.executable, "-c", run], env={**os.environ, "PYTHONPATH": path})
+    child = _until(lambda: (tmp_path / "pid").is_file() and (tmp_path / "pid").read_text())
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    _until(lambda: not _runs(int(child)))
+
+
+def _until(found: Callable[[], Any]) -> Any:
+    for _ in range(600):
+        if value := found():
+            return value
+        time.sleep(0.1)
+    raise AssertionError("not within a minute")
+
+
+def _runs(process: int) -> bool:
+    try:
+        return ") Z " not in Path(f"/proc/{process}/stat").read_text()  # ended, and not yet waited for
+    except FileNotFoundError:
+        return False
