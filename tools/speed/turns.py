@@ -4,7 +4,8 @@ python tools speed.turns OTHER INPUT ... [--seeds 0 1 2] [--threads N] [--masks 
 
 OTHER: a checkout of the other commit, whose core csrc/build_inplace.sh built. INPUT: what `perception map` takes, or
 the word demo, which runs `perception demo`. Where a folder NAME (labels_sam) lies beside the photos, masks are of it;
-where a scene.json lies there, AP is of this commit's `score.instances`. A row kept in OUTPUT is not run again.
+where a scene.json lies there, AP is of this commit's `score.instances`. PSNR and SSIM compare with the held-out photos
+as this commit undistorts them. A row kept in OUTPUT is not run again.
 """
 
 from __future__ import annotations
@@ -25,7 +26,11 @@ import numpy as np
 import perception
 from perception.bench.output import Column, bench_parser, finish, table
 from perception.errors import InputError
+from perception.export.render import as_gaussians
+from perception.gaussians.photos import training_view
 from perception.io.atomic import write_file
+from perception.map.write import read_map
+from perception.pipeline.record import score_views
 from score.instances import score_map
 
 FIGURES = ("cpu_seconds", "seconds", "psnr", "ssim", "ap", "peak_mib")
@@ -73,11 +78,20 @@ def row_of(tree: Path, given: str, seed: int, options: argparse.Namespace, work:
     masks = [f"masks=labels:{folder / options.masks}"] if (folder / options.masks).is_dir() else []
     pairs = [f"seed={seed}", *masks, *options.pairs]
     words = ["map", str(path), "-o", str(work), *(word for pair in pairs for word in ("--set", pair))]
-    facts, used = run(tree, words, options.threads)
-    scores = {key: facts["quality"].get(key) for key in ("psnr", "ssim")}
+    _, used = run(tree, words, options.threads)
+    scores = scores_of(work)
     if (folder / "scene.json").is_file() and (folder / "gt_points.ply").is_file():
         scores["ap"] = score_map(folder, work)["ap"]["all, calibrated"]["ap"]
     return {**used, **scores}
+
+
+def scores_of(path: Path) -> dict[str, Any]:
+    """PSNR and SSIM of a map in its held-out photos, which this commit reads."""
+    gmap = read_map(path)
+    side = gmap.info["config"]["photos"]["max_side"]
+    held = [training_view(view, side) for view in gmap.views if view.held_out]
+    quality = score_views(as_gaussians(gmap), held)
+    return {key: quality.get(key) for key in ("psnr", "ssim")}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
