@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -34,11 +33,13 @@ class Adjustment:
     rms: dict[int, float]
     _found: Adjusted | None
 
-    @cached_property
-    def covariance(self) -> dict[int, np.ndarray]:
+    def covariances(self, lens: dict[int, tuple[float, float]]) -> dict[int, np.ndarray]:
         """[6, 6] by number of the new photo, of rotation vector (map axes, radians) and position. Of all at once, which
-        takes the cube of their number: only when asked for."""
-        return {} if self._found is None else dict(zip(self.inliers, self._found.covariances(), strict=True))
+        takes the cube of their number. lens: as `Adjusted.covariances`, of the photos whose lens is not known."""
+        if self._found is None:
+            return {}
+        errors = np.array([lens.get(number, (0.0, 0.0)) for number in self.inliers])
+        return dict(zip(self.inliers, self._found.covariances(errors), strict=True))
 
 
 def joined(reference: Reference, new: Features, pairs: np.ndarray) -> Features:

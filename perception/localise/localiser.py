@@ -43,6 +43,9 @@ SAME_FOCAL = 0.15
 map's camera to be taken: EXIF states nominal values."""
 USUAL_FOCAL = 1.2
 """Focal length of an unknown camera to start from, in long sides of the picture, as COLMAP takes it."""
+OWN, OTHER = (0.02, 0.01), (0.3, 0.1)
+"""Standard errors of the focal length of a lens that was not given, as a share of it, and of its principal point, as a
+share of the long side, before features tell: of a photo of the size of the map's; of another, which may be cropped."""
 OTHER_UNIT = 1.5
 """Measured depth is scaled if it differs from that of the map's points by this factor: it has another unit."""
 
@@ -190,7 +193,18 @@ class _Search:
                 self._drop(wrong, "its matches with the other new photos contradict its pose")
             elif not self._reach(found, candidates):
                 break
-        return [self._answer(number, found) for number in range(len(self.photos))]
+        covariances = {} if found is None else found.covariances(self._lens_errors())
+        return [self._answer(number, found, covariances) for number in range(len(self.photos))]
+
+    def _lens_errors(self) -> dict[int, tuple[float, float]]:
+        """Of the photos whose lens was not given, by number: see `Adjustment.covariances`."""
+        sizes = {view.photo_size for view in self.reference.views}
+        errors = {}
+        for number in (number for number, photo in enumerate(self.photos) if photo.lens is None):
+            size = self.views[number].photo_size
+            focal, centre = OWN if size in sizes else OTHER
+            errors[number] = focal, centre * max(size)
+        return errors
 
     def _share_lenses(self, candidates: dict[int, np.ndarray]) -> None:
         """Photos with one assumed lens were taken by one camera: all get the median of the estimates. A photo that was
@@ -285,12 +299,12 @@ class _Search:
     def _all_links(self) -> np.ndarray:
         return np.concatenate([np.empty((0, 2), np.int64), *(self.links[n] for n in sorted(self.links))])
 
-    def _answer(self, number: int, found: Adjustment | None) -> Localised | NotHere:
+    def _answer(self, number: int, found: Adjustment | None, covariances: dict[int, np.ndarray]) -> Localised | NotHere:
         photo = self.photos[number]
         if number not in self.placed or found is None:
             return NotHere(photo.name, photo.photo, f"not in this map: {self.why[number]}")
         lens, pose = view_lens(self.views[number]), self.placed[number]
-        figures = found.covariance[number], found.inliers[number], found.rms[number]
+        figures = covariances[number], found.inliers[number], found.rms[number]
         return Localised(photo.name, photo.photo, lens, pose, *figures, photo.mask, photo.depth)
 
 

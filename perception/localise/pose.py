@@ -23,6 +23,7 @@ EQUAL = 0.7
 features that the first does not, as the other way round: equal textures in two spots, or a thing that was moved."""
 SAME_ANGLE, SAME_SHARE = 3.0, 0.05
 """Poses are the same if they differ by less than this angle in degrees and this share of the distance to the points."""
+REFINED, FOUND = 1, 2
 KNOWN, LIKELY, GUESSED = np.inf, 1.15, 1.0
 CLOSELY = 0.25
 """How far a lens is trusted: an estimated one replaces it if that makes this many times as many features agree closely,
@@ -38,6 +39,8 @@ _PINHOLE = (
     cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST
     | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
 )  # fmt: skip
+SQUARE = 0.01
+"""Largest relative difference of the focal lengths of square pixels, as photos are resized to whole pixels."""
 USUAL = 0.1, 10.0, 1.0
 """Least and largest focal length of an estimated lens in long sides of the picture, and largest coefficient of
 distortion, as in COLMAP's mapper: flat things leave all of these open."""
@@ -94,12 +97,25 @@ def find_pose(matched: Matched, lens: Lens, trust: float, doubt: Callable[[Pose]
 
 def _ransac(matched: Matched, used: np.ndarray, lens: Lens, trust: float) -> Pose | None:
     """The pose that most of the `used` matches agree with, refined by them; None if none is found."""
-    best = _estimated(matched, used, lens, free=False)
-    for model in [] if trust == KNOWN else dict.fromkeys((lens, _with_distortion(lens))):
-        free = _estimated(matched, used, model, free=True)
-        better = best is None or free is None or (free.close >= trust * best.close and free.count >= best.count / trust)
-        best = free if free is not None and better else best
+    best = _estimated(matched, used, lens)
+    for model in [] if trust == KNOWN else dict.fromkeys((_with_square_pixels(lens), _with_distortion(lens))):
+        for free in (_estimated(matched, used, model, FOUND), _refined(matched, used, model)):
+            if free is not None and (
+                best is None or (free.close >= trust * best.close and free.count >= best.count / trust)
+            ):
+                best = free
     return best if best is None or trust == KNOWN else _recentred(matched, used, best)
+
+
+def _refined(matched: Matched, used: np.ndarray, lens: Lens) -> Pose | None:
+    """The pose with a lens that is refined from `lens`, step by step: on a plane no focal length is found otherwise."""
+    pose: Pose | None = None
+    for _ in range(STEPS):
+        further = _estimated(matched, used, lens, REFINED)
+        if further is None or (pose is not None and (further.count, further.close) <= (pose.count, pose.close)):
+            break
+        pose, lens = further, further.lens
+    return pose
 
 
 def _recentred(matched: Matched, used: np.ndarray, pose: Pose) -> Pose:
@@ -108,7 +124,7 @@ def _recentred(matched: Matched, used: np.ndarray, pose: Pose) -> Pose:
     moved = pose
     for _ in range(STEPS):
         lens = _with_centre(matched, used & moved.inliers, moved.lens)
-        further = None if lens is None else _estimated(matched, used, lens, free=False)
+        further = None if lens is None else _estimated(matched, used, lens)
         if further is None or (further.count, further.close) <= (moved.count, moved.close):
             break
         moved = further
@@ -139,6 +155,13 @@ def cropped(lens: Lens, estimated: Lens) -> bool:
     return bool(np.linalg.norm(other - middle) > 1)
 
 
+def _with_square_pixels(lens: Lens) -> Lens:
+    """A pinhole with nearly one focal length as one with one: flat things leave the ratio of two open."""
+    if lens.model != "PINHOLE" or abs(lens.params[0] / lens.params[1] - 1) > SQUARE:
+        return lens
+    return Lens("SIMPLE_PINHOLE", (float(np.mean(lens.params[:2])), *lens.params[2:]), lens.width, lens.height)
+
+
 def _with_distortion(lens: Lens) -> Lens:
     """A pinhole as a lens with radial distortion, which is 0."""
     if lens.model not in ("PINHOLE", "SIMPLE_PINHOLE"):
@@ -147,14 +170,17 @@ def _with_distortion(lens: Lens) -> Lens:
     return Lens("SIMPLE_RADIAL", (focal, *centre, 0.0), lens.width, lens.height)
 
 
-def _estimated(matched: Matched, used: np.ndarray, lens: Lens, free: bool) -> Pose | None:
+def _estimated(matched: Matched, used: np.ndarray, lens: Lens, free: int = 0) -> Pose | None:
+    """The pose by `lens`, whose focal length and distortion are kept (0), refined (REFINED), or found by RANSAC and
+    refined (FOUND)."""
     if used.sum() < MIN_INLIERS:
         return None
     pycolmap, camera = load_pycolmap(), camera_from_lens(lens)
     estimation, refinement = pycolmap.AbsolutePoseEstimationOptions(), pycolmap.AbsolutePoseRefinementOptions()
     estimation.ransac.max_error = most = tolerance(max(lens.width, lens.height))
     estimation.ransac.random_seed = 0
-    estimation.estimate_focal_length = refinement.refine_focal_length = refinement.refine_extra_params = free
+    estimation.estimate_focal_length = free == FOUND
+    refinement.refine_focal_length = refinement.refine_extra_params = free > 0
     pixel, point = matched.pixel[used], matched.point[used]
     found = pycolmap.estimate_and_refine_absolute_pose(pixel, point, camera, estimation, refinement)
     if found is None or not np.isfinite(camera.params).all() or (free and camera.has_bogus_params(*USUAL)):

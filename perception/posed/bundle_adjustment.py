@@ -132,13 +132,32 @@ class Adjusted:
     points: np.ndarray
     _problem: _Problem
 
-    def covariances(self) -> np.ndarray:
+    def covariances(self, lens: np.ndarray) -> np.ndarray:
         """[K, 6, 6] of the K poses that are not held, each as `Poses.turned` takes its change; of points as well as
-        poses: the blocks of the inverse of the reduced normal matrix (Triggs et al. 2000, section 6.1)."""
+        poses: the blocks of the inverse of the reduced normal matrix (Triggs et al. 2000, section 6.1).
+        lens [K, 2]: standard errors of the focal length, relative to it, and of the principal point in pixels, before
+        features tell more of them; 0 where they are known. What they add is of each pose with the others held."""
         free = self._problem.free
-        count, reduced = len(free) // 6, _normal(self._problem, self.poses, self.points, 0.0)[0]
+        count, (reduced, _, V_inverse, _, _) = len(free) // 6, _normal(self._problem, self.poses, self.points, 0.0)
         inverse = np.linalg.inv(reduced[free][:, free].toarray()).reshape(count, 6, count, 6)
-        return np.asarray(inverse[np.arange(count), :, np.arange(count)])
+        found = np.asarray(inverse[np.arange(count), :, np.arange(count)])
+        if (unknown := lens.all(axis=1)).any():
+            views = np.flatnonzero(~self._problem.held)[unknown]
+            found[unknown] += self._by_lens(V_inverse, views, lens[unknown])
+        return found
+
+    def _by_lens(self, V_inverse: np.ndarray, views: np.ndarray, lens: np.ndarray) -> np.ndarray:
+        """[L, 6, 6] that the covariances of the poses of L views grow by as their lenses are not known."""
+        problem, tracks = self._problem, self._problem.tracks
+        _, J_pose, J_point = _linearised(problem, self.poses, self.points)
+        J = np.concatenate([J_pose, _lens_jacobian(problem, self.poses, self.points)], axis=2)
+        W = np.einsum("orv,orw->ovw", J, J_point)
+        each = np.einsum("orv,orw->ovw", J, J) - W @ V_inverse[tracks.point] @ np.swapaxes(W, 1, 2)
+        S = sums_by(tracks.view, each, len(self.poses.center))[views]
+        A, B, C = S[:, :6, :6], S[:, :6, 6:], S[:, 6:, 6:]
+        C = C + np.eye(3) / np.square(lens[:, [0, 1, 1]])[:, None]
+        moved = np.linalg.solve(A, B)  # of the pose, by each parameter
+        return moved @ np.linalg.solve(C - np.swapaxes(B, 1, 2) @ moved, np.swapaxes(moved, 1, 2))
 
 
 def _normalised(problem: _Problem, poses: Poses, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -213,9 +232,7 @@ def _linearised(problem: _Problem, poses: Poses, points: np.ndarray) -> tuple[np
     slope[:, :2, 2] = -tracks.focal[:, None] / sigma * x[:, :2] / z[:, None] ** 2
     known = tracks.depth > 0
     slope[:, 2, 2] = np.where(known, 1 / (problem.depth_sigma * np.where(known, tracks.depth, 1)), 0)
-    weight = np.repeat(1 / (1 + (error**2).sum(1) / CAUCHY**2), 2).reshape(-1, 2)
-    weight = np.concatenate([weight, 1 / (1 + depth[:, None] ** 2 / CAUCHY**2)], axis=1)
-    root = np.sqrt(np.where(front[:, None], weight, 0.0))
+    root = _roots(error, depth, front)
     J_point = root[..., None] * (slope @ poses.rotation[tracks.view])
     arm = points[tracks.point] - poses.center[tracks.view]
     # x_camera = R Exp(θ)ᵀ (p − c − δ):  ∂/∂θ = R [p − c]×,  ∂/∂δ = −R.
@@ -223,6 +240,23 @@ def _linearised(problem: _Problem, poses: Poses, points: np.ndarray) -> tuple[np
     J_pose[problem.held[tracks.view]] = 0
     residual = np.concatenate([np.where(front[:, None], error, 0.0), depth[:, None]], axis=1)
     return root * residual, J_pose, J_point
+
+
+def _roots(error: np.ndarray, depth: np.ndarray, front: np.ndarray) -> np.ndarray:
+    """Roots [O, 3] of the weights of the loss, 0 behind the camera."""
+    weight = np.repeat(1 / (1 + (error**2).sum(1) / CAUCHY**2), 2).reshape(-1, 2)
+    weight = np.concatenate([weight, 1 / (1 + depth[:, None] ** 2 / CAUCHY**2)], axis=1)
+    return np.sqrt(np.where(front[:, None], weight, 0.0))
+
+
+def _lens_jacobian(problem: _Problem, poses: Poses, points: np.ndarray) -> np.ndarray:
+    """Jacobian [O, 3, 3] of the weighted residuals by the logarithm of the focal length and the principal point."""
+    error, depth, x = _normalised(problem, poses, points)
+    front = x[:, 2] > NEAR
+    J = np.zeros((len(x), 3, 3))
+    J[:, :2, 0] = problem.tracks.focal[:, None] * x[:, :2] / np.where(front, x[:, 2], 1.0)[:, None]
+    J[:, 0, 1] = J[:, 1, 2] = 1
+    return _roots(error, depth, front)[..., None] * J / problem.sigma
 
 
 def _solved(A: Any, b: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from perception.posed.bundle_adjustment import Poses, adjust
+from perception.posed.bundle_adjustment import LEAST_PIXELS, Poses, adjust, residuals
 from perception.posed.pose_refinement import poses_of
 from perception.sfm.tracks import Tracks
 from support.aimed import look_at
@@ -77,9 +77,43 @@ def test_covariances_are_those_of_repeated_noise() -> None:
         noisy = replace(tracks, rays=tracks.rays + rng.normal(scale=NOISE / FOCAL, size=tracks.rays.shape))
         found = adjust(noisy, begun, begun, (0.1, 0.4), HELD)
         changes.append(found.poses.since(poses)[-1])
-        covariances.append(found.covariances()[0])
+        covariances.append(found.covariances(np.zeros((1, 2)))[0])
     seen, told = np.std(changes, axis=0), np.sqrt(np.mean([np.diag(c) for c in covariances], axis=0))
     # 40 draws give a standard deviation to 11 %, and the mean of six to 5 %. The weights of the robust loss take away a
     # fifth of the information; steps that gain little are not taken, so that poses stay a little nearer to the start.
     ratio = told / seen
     assert 0.85 < np.exp(np.log(ratio).mean()) < 1.45 and np.all((ratio > 0.7) & (ratio < 1.8)), ratio
+
+
+@pytest.mark.parametrize("depth", [1.0, 0.01])  # of the box of points, to its width: flat things leave the lens open
+def test_a_lens_that_is_not_known_adds_to_the_covariance(depth: float) -> None:
+    """Oracle: the dense normal matrix of pose, lens and all points, by central differences of the residuals."""
+    poses, points, tracks = made()
+    points = points * (1, depth, 1)
+    x = np.einsum("oij,oj->oi", poses.rotation[tracks.view], points[tracks.point] - poses.center[tracks.view])
+    tracks = replace(tracks, rays=x[:, :2] / x[:, 2:])
+    errors = np.array([0.3, 60.0])  # relative, pixels
+    last = tracks.view == VIEWS - 1
+
+    def residual(change: np.ndarray) -> np.ndarray:
+        delta = np.zeros((VIEWS, 6))
+        delta[-1] = change[:6]
+        focal = np.where(last, FOCAL * np.exp(change[6]), FOCAL)
+        # A pixel stays where it is: with another lens it is another ray.
+        moved = last[:, None] * change[7:9]
+        rays = (tracks.rays * FOCAL - moved) / focal[:, None]
+        other = replace(tracks, focal=focal, rays=rays)
+        pixels = residuals(other, poses.turned(delta), points + change[9:].reshape(-1, 3))[0] / LEAST_PIXELS
+        return np.concatenate([pixels.ravel(), change[6:9] / errors[[0, 1, 1]]])
+
+    steps = 1e-5 * np.eye(9 + points.size)
+    J = np.stack([(residual(step) - residual(-step)) / 2e-5 for step in steps], axis=1)
+    known = np.delete(np.arange(len(steps)), [6, 7, 8])
+    expected = np.linalg.inv(J.T @ J)[:6, :6] - np.linalg.inv(J[:, known].T @ J[:, known])[:6, :6]
+    found = adjust(tracks, poses, poses, (1e3, 1e3), HELD)
+    added = found.covariances(errors[None])[0] - found.covariances(np.zeros((1, 2)))[0]
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(added / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.01)
+    assert np.trace(added[3:, 3:]) > (100 if depth < 1 else 1) * np.trace(
+        found.covariances(np.zeros((1, 2)))[0][3:, 3:]
+    )
