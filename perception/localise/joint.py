@@ -41,6 +41,11 @@ class Adjustment:
         errors = np.array([lens.get(number, (0.0, 0.0)) for number in self.inliers])
         return dict(zip(self.inliers, self._found.covariances(errors), strict=True))
 
+    def lens_step(self, number: int, focal: float, centre: float) -> np.ndarray:
+        """[3] of a placed photo: see `Adjusted.lens_step`."""
+        assert self._found is not None
+        return self._found.lens_step(list(self.inliers).index(number), focal, centre)
+
 
 def joined(reference: Reference, new: Features, pairs: np.ndarray) -> Features:
     """The features of both, those of the new photos after those of the map's views."""

@@ -22,11 +22,11 @@ from perception.geometry import transform
 from perception.localise.evidence import doubt
 from perception.localise.joint import Adjustment, adjusted, contradicted
 from perception.localise.keypoints import described, tolerance
-from perception.localise.pose import GUESSED, KNOWN, LIKELY, MIN_INLIERS, Matched, cropped, find_pose
+from perception.localise.lenses import OTHER, OWN, lens_of, median, moved
+from perception.localise.pose import KNOWN, MIN_INLIERS, Matched, cropped, find_pose
 from perception.localise.reference import Locate, Reference, open_reference
 from perception.map.map import Map
-from perception.photos.decode import CAMERA_FOLDER, exif_of, open_photo, photo_size, why_left_out
-from perception.photos.lens import camera_from_lens, rescale_lens, same_aspect
+from perception.photos.decode import photo_size, why_left_out
 from perception.photos.still import with_still
 from perception.photos.view_json import locate_photo
 from perception.photos.views import make_view, view_lens
@@ -38,14 +38,8 @@ from perception.types import DepthImage, Lens, View
 
 ALIKE, MORE = 10, 60
 """Photos of the map that a new photo is matched with: the most alike, and if they give no pose, so many more."""
-SAME_FOCAL = 0.15
-"""Largest relative difference of a photo's focal length in EXIF from that of the map's camera of the same size, for the
-map's camera to be taken: EXIF states nominal values."""
-USUAL_FOCAL = 1.2
-"""Focal length of an unknown camera to start from, in long sides of the picture, as COLMAP takes it."""
-OWN, OTHER = (0.02, 0.01), (0.3, 0.1)
-"""Standard errors of the focal length of a lens that was not given, as a share of it, and of its principal point, as a
-share of the long side, before features tell: of a photo of the size of the map's; of another, which may be cropped."""
+LENS_STEPS, LENS_STEP = 10, 0.1
+"""Most steps of the lens of a photo that may be cropped, each with a new pose; pixels of the last one that counts."""
 OTHER_UNIT = 1.5
 """Measured depth is scaled if it differs from that of the map's points by this factor: it has another unit."""
 
@@ -159,7 +153,7 @@ class _Search:
 
     def __init__(self, reference: Reference, photos: list[NewPhoto], folder: Path, progress: Progress) -> None:
         self.reference, self.photos, self.progress = reference, photos, progress
-        lenses, self.trust = zip(*(_lens_of(photo, reference.views) for photo in photos), strict=True)
+        lenses, self.trust = zip(*(lens_of(photo.photo, photo.lens, reference.views) for photo in photos), strict=True)
         paths, options = [photo.photo for photo in photos], ReadOptions(folder, progress=progress)
         masks, stored = [photo.mask for photo in photos], [photo.as_stored for photo in photos]
         self.store = build_features(paths, list(lenses), options, masks, as_stored=stored)
@@ -184,6 +178,16 @@ class _Search:
             self.progress.update("localise: photos", number + 1, len(self.photos))
         self._share_lenses(candidates)
         self._use_one_unit()
+        found = self._together(candidates)
+        for _ in range(LENS_STEPS):
+            if found is None or not self._refine_lenses(found):
+                break
+            found = self._together(candidates)
+        covariances = {} if found is None else found.covariances(self._lens_errors())
+        return [self._answer(number, found, covariances) for number in range(len(self.photos))]
+
+    def _together(self, candidates: dict[int, np.ndarray]) -> Adjustment | None:
+        """Refines all poses at once, drops what is contradicted, and reaches what only new photos see."""
         found = None
         while self.placed:
             found = adjusted(self.reference, self.new, self.placed, self._all_links(), self.most)
@@ -193,8 +197,19 @@ class _Search:
                 self._drop(wrong, "its matches with the other new photos contradict its pose")
             elif not self._reach(found, candidates):
                 break
-        covariances = {} if found is None else found.covariances(self._lens_errors())
-        return [self._answer(number, found, covariances) for number in range(len(self.photos))]
+        return found
+
+    def _refine_lenses(self, found: Adjustment) -> bool:
+        """A step of each lens that may be of a cropped photo and is of that photo alone; whether one changed much."""
+        lenses, most = [view_lens(view) for view in self.views], 0.0
+        for number, errors in self._lens_errors().items():
+            if number in self.placed and errors[0] == OTHER[0] and lenses.count(lenses[number]) == 1:
+                step = found.lens_step(number, *errors)
+                lenses[number] = moved(lenses[number], *step)
+                most = max(most, *abs(step * (max(self.views[number].photo_size), 1, 1)))
+        if most >= LENS_STEP:
+            self._see(lenses)
+        return most >= LENS_STEP
 
     def _lens_errors(self) -> dict[int, tuple[float, float]]:
         """Of the photos whose lens was not given, by number: see `Adjustment.covariances`."""
@@ -216,7 +231,7 @@ class _Search:
                 own[number] = self.lenses[number]
             else:
                 shared.setdefault(lenses[number], []).append(self.lenses[number])
-        chosen = {lens: _median(found) for lens, found in shared.items()}
+        chosen = {lens: median(found) for lens, found in shared.items()}
         if not own and all(lens == found for lens, found in chosen.items()):
             return
         others = [lens if sure else chosen.get(lens, lens) for lens, sure in zip(lenses, known, strict=True)]
@@ -316,42 +331,6 @@ def _in_unit(depth: DepthImage | None, factor: float) -> DepthImage | None:
 def _view(photo: NewPhoto, lens: Lens) -> View:
     view = make_view(photo.name, photo.photo, lens, np.eye(4), photo.photo)
     return replace(view, depth=photo.depth, mask=photo.mask, as_stored=photo.as_stored)
-
-
-def _lens_of(photo: NewPhoto, views: list[View]) -> tuple[Lens, float]:
-    """The lens of a photo, and how far it is trusted: given; else the map's camera of the same shape, unless EXIF has
-    another focal length; else EXIF's or a usual one."""
-    if photo.lens is not None:
-        return photo.lens, KNOWN
-    width, height = photo_size(photo.photo)
-    stated = _exif_focal(photo.photo, max(width, height))
-    for view in views:
-        lens = view_lens(view)
-        if same_aspect((width, height), (lens.width, lens.height)):
-            lens = rescale_lens(lens, width, height)
-            focal = camera_from_lens(lens).mean_focal_length()
-            if stated is None or abs(stated / focal - 1) <= SAME_FOCAL:
-                return lens, LIKELY
-    focal = USUAL_FOCAL * max(width, height) if stated is None else stated
-    return Lens("SIMPLE_RADIAL", (focal, width / 2, height / 2, 0.0), width, height), GUESSED
-
-
-def _median(lenses: Sequence[Lens]) -> Lens:
-    """The medians of the parameters of those that have the most frequent model, of several the first by name."""
-    models = Counter(sorted(lens.model for lens in lenses))
-    model = models.most_common(1)[0][0]
-    rows = [lens.params for lens in lenses if lens.model == model]
-    middle = np.sort(np.array(rows, np.float64), axis=0)[len(rows) // 2]
-    return replace(lenses[0], model=model, params=tuple(middle.tolist()))
-
-
-def _exif_focal(photo: Path, long_side: int) -> float | None:
-    """The focal length in pixels by EXIF's for 35 mm film, whose long side is 36 mm; None where it is not stated."""
-    with open_photo(photo) as image:
-        millimetres = exif_of(image, photo, CAMERA_FOLDER).get(0xA405)
-    if isinstance(millimetres, (int, float)) and 5 <= millimetres <= 500:
-        return millimetres / 36 * long_side
-    return None
 
 
 def _finder(gmap: Map, folder: Path | None) -> Locate:

@@ -141,23 +141,35 @@ class Adjusted:
         count, (reduced, _, V_inverse, _, _) = len(free) // 6, _normal(self._problem, self.poses, self.points, 0.0)
         inverse = np.linalg.inv(reduced[free][:, free].toarray()).reshape(count, 6, count, 6)
         found = np.asarray(inverse[np.arange(count), :, np.arange(count)])
-        if (unknown := lens.all(axis=1)).any():
-            views = np.flatnonzero(~self._problem.held)[unknown]
-            found[unknown] += self._by_lens(V_inverse, views, lens[unknown])
+        unknown = np.flatnonzero(lens.all(axis=1))
+        moved, schur, _ = self._by_lens(V_inverse, unknown, lens[unknown])
+        found[unknown] += moved @ np.linalg.solve(schur, np.swapaxes(moved, 1, 2))
         return found
 
-    def _by_lens(self, V_inverse: np.ndarray, views: np.ndarray, lens: np.ndarray) -> np.ndarray:
-        """[L, 6, 6] that the covariances of the poses of L views grow by as their lenses are not known."""
+    def lens_step(self, number: int, focal: float, centre: float) -> np.ndarray:
+        """[3]: what a step of Gauss-Newton adds to the logarithm of the focal length and to the principal point of the
+        pose `number` of those that are not held, as its features tell. focal, centre: as of `covariances`."""
+        V_inverse = _normal(self._problem, self.poses, self.points, 0.0)[2]
+        _, schur, right = self._by_lens(V_inverse, np.array([number]), np.array([[focal, centre]]))
+        return np.asarray(np.linalg.solve(schur[0], right[0]))
+
+    def _by_lens(
+        self, V_inverse: np.ndarray, numbers: np.ndarray, lens: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of the lenses of L poses, with points and poses eliminated: how each parameter moves the pose [L, 6, 3], the
+        normal matrix [L, 3, 3] and the right side [L, 3]."""
         problem, tracks = self._problem, self._problem.tracks
-        _, J_pose, J_point = _linearised(problem, self.poses, self.points)
+        views = np.flatnonzero(~problem.held)[numbers]
+        residual, J_pose, J_point = _linearised(problem, self.poses, self.points)
         J = np.concatenate([J_pose, _lens_jacobian(problem, self.poses, self.points)], axis=2)
         W = np.einsum("orv,orw->ovw", J, J_point)
         each = np.einsum("orv,orw->ovw", J, J) - W @ V_inverse[tracks.point] @ np.swapaxes(W, 1, 2)
         S = sums_by(tracks.view, each, len(self.poses.center))[views]
+        g = -sums_by(tracks.view, np.einsum("orv,or->ov", J, residual), len(self.poses.center))[views]
         A, B, C = S[:, :6, :6], S[:, :6, 6:], S[:, 6:, 6:]
         C = C + np.eye(3) / np.square(lens[:, [0, 1, 1]])[:, None]
-        moved = np.linalg.solve(A, B)  # of the pose, by each parameter
-        return moved @ np.linalg.solve(C - np.swapaxes(B, 1, 2) @ moved, np.swapaxes(moved, 1, 2))
+        moved = np.linalg.solve(A, B)
+        return moved, C - np.swapaxes(B, 1, 2) @ moved, g[:, 6:] - np.einsum("lpk,lp->lk", moved, g[:, :6])
 
 
 def _normalised(problem: _Problem, poses: Poses, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from perception.localise.localiser import _median
+from perception.localise.lenses import median
 from perception.localise.pose import GUESSED, KNOWN, LIKELY, MIN_INLIERS, Matched, Pose, cropped, find_pose
 from perception.types import Lens
 from support.painted_room import difference, pose_at
@@ -159,5 +159,5 @@ def test_a_pinhole_is_replaced_where_the_photo_is_distorted(k: float) -> None:
 
 def test_photos_of_one_camera_get_the_median_of_their_lenses() -> None:
     bent = [Lens("SIMPLE_RADIAL", (500.0 + n, 320.0, 240.0, k), 640, 480) for n, k in enumerate((-0.2, 0.3, -0.1))]
-    assert _median([LENS, *bent]) == Lens("SIMPLE_RADIAL", (501.0, 320.0, 240.0, -0.1), 640, 480)
-    assert _median([LENS, *bent, LENS, LENS]) == LENS
+    assert median([LENS, *bent]) == Lens("SIMPLE_RADIAL", (501.0, 320.0, 240.0, -0.1), 640, 480)
+    assert median([LENS, *bent, LENS, LENS]) == LENS
