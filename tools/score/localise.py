@@ -1,15 +1,15 @@
 """Scores the poses that `localise` finds for the photos of a posed input, against the input's poses.
 
-python tools score.localise KNOWN VISIT [--gone] [--alone] [--truth TRANSFORMS]
-python tools score.localise KNOWN --leave-out N [--truth TRANSFORMS]
+python tools score.localise KNOWN VISIT [--gone] [--alone] [--cropped SEED] [--truth TRANSFORMS]
+python tools score.localise KNOWN --leave-out N [--alone] [--cropped SEED] [--truth TRANSFORMS]
 
 KNOWN: a map, or a posed input, of which no map is made, as localisation needs photos and poses. VISIT: a posed input in
 KNOWN's world; its poses are the truth, and only its lenses and depth images are used. --gone: the map's photos are not
-used, only its renders. --alone: a call for each photo, as a robot asks. --leave-out N: every N-th photo of KNOWN, a
-transforms.json, is left out and localised. --truth: other poses of the same photos. Prints a line for each photo, then
-one JSON object; seconds are of CPU time. With --truth,
-from which KNOWN's refined poses differ together, "own_photos" has their errors, and "beside" those of the new photos
-relative to the nearest of KNOWN's.
+used, only its renders. --alone: a call for each photo, as a robot asks. --cropped: of each photo a random part, 50 to
+85 % of its width and height, without lens and depth. --leave-out N: every N-th photo of KNOWN, a transforms.json, is
+left out and localised. --truth: other poses of the same photos. Prints a line for each photo, then one JSON object;
+seconds are of CPU time. With --truth, from which KNOWN's refined poses differ together, "own_photos" has their errors,
+and "beside" those of the new photos relative to the nearest of KNOWN's.
 """
 
 from __future__ import annotations
@@ -24,14 +24,16 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
+from perception.export.render import write_picture
 from perception.frame.recentre import map_from_input, moved
 from perception.geometry import camera_centres, inverse_se3
 from perception.inputs.load import load_scene
 from perception.inputs.readers import reader_of
 from perception.inputs.transforms import transforms_files
-from perception.localise.localiser import Localised, Localiser, NotHere
+from perception.localise.localiser import Localised, Localiser, NewPhoto, NotHere
 from perception.localise.photos import NO_POINTS, new_photos
 from perception.map.map import Map
+from perception.photos.decode import read_photo
 from perception.progress import QUIET
 from perception.sfm.options import ReadOptions
 from perception.types import View
@@ -61,6 +63,18 @@ def split(known: Path, every: int, workdir: Path) -> tuple[Path, Path]:
     for path, part in zip(paths, parts, strict=True):
         path.write_text(json.dumps({**data, "frames": part}))
     return paths
+
+
+def cropped(photos: list[NewPhoto], folder: Path, seed: int) -> list[NewPhoto]:
+    """A random part of each photo, as a picture in `folder`, without lens and depth."""
+    rng, parts = np.random.default_rng(seed), []
+    for number, photo in enumerate(photos):
+        pixels = read_photo(photo.photo, photo.as_stored)
+        size = np.round(pixels.shape[:2] * rng.uniform(0.5, 0.85, 2)).astype(int)
+        top, left = rng.integers(0, pixels.shape[:2] - size + 1)
+        write_picture(folder / f"{number}.png", pixels[top : top + size[0], left : left + size[1]])
+        parts.append(NewPhoto(photo.name, folder / f"{number}.png"))
+    return parts
 
 
 def difference(pose: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
@@ -116,6 +130,8 @@ def score(args: argparse.Namespace, workdir: Path) -> dict[str, Any]:
         gmap = Map(views=load_scene(args.known, ReadOptions(workdir / "known")).views, info={})
     placed = map_from_input(args.known, gmap.info)
     new = new_photos([args.visit], None, workdir, QUIET)
+    if args.cropped is not None:
+        new = cropped(new, workdir, args.cropped)
     truth = {Path(view.name).name: moved(view, placed) for view in truth_of(args.truth or args.visit, workdir)}
     started = time.process_time()
     localiser = Localiser(gmap, locate=gone if args.gone else None)
@@ -149,6 +165,7 @@ def main() -> None:
     parser.add_argument("visit", type=Path, nargs="?")
     for flag in ("--gone", "--alone"):
         parser.add_argument(flag, action="store_true")
+    parser.add_argument("--cropped", type=int, metavar="SEED")
     parser.add_argument("--leave-out", type=int, default=0)
     parser.add_argument("--truth", type=Path)
     args = parser.parse_args()
