@@ -41,8 +41,8 @@ class Adjustment:
         errors = np.array([lens.get(number, (0.0, 0.0)) for number in self.inliers])
         return dict(zip(self.inliers, self._found.covariances(errors), strict=True))
 
-    def lens_step(self, number: int, focal: float, centre: float) -> np.ndarray:
-        """[3] of a placed photo: see `Adjusted.lens_step`."""
+    def lens_step(self, number: int, focal: float, centre: float) -> tuple[np.ndarray, np.ndarray]:
+        """Of a placed photo: see `Adjusted.lens_step`."""
         assert self._found is not None
         return self._found.lens_step(list(self.inliers).index(number), focal, centre)
 

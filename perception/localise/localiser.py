@@ -201,21 +201,25 @@ class _Search:
 
     def _refine_lenses(self, found: Adjustment) -> bool:
         """A step of each lens that may be of a cropped photo and is of that photo alone; whether one changed much."""
-        lenses, most = [view_lens(view) for view in self.views], 0.0
+        lenses, count = [view_lens(view) for view in self.views], len(self.reference.views)
+        poses, most = dict(self.placed), 0.0
         for number, errors in self._lens_errors().items():
-            if number in self.placed and errors[0] == OTHER[0] and lenses.count(lenses[number]) == 1:
-                step = found.lens_step(number, *errors)
+            if errors[0] == OTHER[0] and lenses.count(lenses[number]) == 1:
+                step, turn = found.lens_step(number, *errors)
                 lenses[number] = moved(lenses[number], *step)
+                poses[number] = found.poses.at(count + number).turned(turn[None]).matrices()[0]
                 most = max(most, *abs(step * (max(self.views[number].photo_size), 1, 1)))
-        if most >= LENS_STEP:
-            self._see(lenses)
-        return most >= LENS_STEP
+        if most < LENS_STEP:
+            return False
+        self.placed = poses
+        self._see(lenses)
+        return True
 
     def _lens_errors(self) -> dict[int, tuple[float, float]]:
-        """Of the photos whose lens was not given, by number: see `Adjustment.covariances`."""
+        """Of the placed photos whose lens was not given, by number: see `Adjustment.covariances`."""
         sizes = {view.photo_size for view in self.reference.views}
         errors = {}
-        for number in (number for number, photo in enumerate(self.photos) if photo.lens is None):
+        for number in sorted(number for number in self.placed if self.photos[number].lens is None):
             size = self.views[number].photo_size
             focal, centre = OWN if size in sizes else OTHER
             errors[number] = focal, centre * max(size)

@@ -33,6 +33,10 @@ class Poses:
     rotation: np.ndarray
     center: np.ndarray
 
+    def at(self, number: int) -> Poses:
+        """One of them."""
+        return Poses(self.rotation[number : number + 1], self.center[number : number + 1])
+
     def turned(self, delta: np.ndarray) -> Poses:
         """Each camera turned by delta[:, :3] (rotation vector, world axes, radians) and moved by delta[:, 3:]."""
         return Poses(self.rotation @ Rotation.from_rotvec(-delta[:, :3]).as_matrix(), self.center + delta[:, 3:])
@@ -146,12 +150,15 @@ class Adjusted:
         found[unknown] += moved @ np.linalg.solve(schur, np.swapaxes(moved, 1, 2))
         return found
 
-    def lens_step(self, number: int, focal: float, centre: float) -> np.ndarray:
+    def lens_step(self, number: int, focal: float, centre: float) -> tuple[np.ndarray, np.ndarray]:
         """[3]: what a step of Gauss-Newton adds to the logarithm of the focal length and to the principal point of the
-        pose `number` of those that are not held, as its features tell. focal, centre: as of `covariances`."""
+        pose `number` of those that are not held, as its features tell; [6]: to that pose, as `Poses.turned` takes it.
+        focal, centre: as of `covariances`; no step is longer."""
         V_inverse = _normal(self._problem, self.poses, self.points, 0.0)[2]
-        _, schur, right = self._by_lens(V_inverse, np.array([number]), np.array([[focal, centre]]))
-        return np.asarray(np.linalg.solve(schur[0], right[0]))
+        moved, schur, right = self._by_lens(V_inverse, np.array([number]), np.array([[focal, centre]]))
+        step = np.linalg.solve(schur[0], right[0])
+        step = step / max(1.0, *abs(step / (focal, centre, centre)))
+        return step, -moved[0] @ step
 
     def _by_lens(
         self, V_inverse: np.ndarray, numbers: np.ndarray, lens: np.ndarray
