@@ -41,10 +41,10 @@ class Adjustment:
         errors = np.array([lens.get(number, (0.0, 0.0)) for number in self.inliers])
         return dict(zip(self.inliers, self._found.covariances(errors), strict=True))
 
-    def lens_step(self, number: int, focal: float, centre: float) -> tuple[np.ndarray, np.ndarray]:
+    def lens_step(self, number: int, focal: float, centre: float, changed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Of a placed photo: see `Adjusted.lens_step`."""
         assert self._found is not None
-        return self._found.lens_step(list(self.inliers).index(number), focal, centre)
+        return self._found.lens_step(list(self.inliers).index(number), focal, centre, changed)
 
 
 def joined(reference: Reference, new: Features, pairs: np.ndarray) -> Features:

@@ -39,7 +39,7 @@ from perception.types import DepthImage, Lens, View
 ALIKE, MORE = 10, 60
 """Photos of the map that a new photo is matched with: the most alike, and if they give no pose, so many more."""
 LENS_STEPS, LENS_STEP = 10, 0.1
-"""Most steps of the lens of a photo that may be cropped, each with a new pose; pixels of the last one that counts."""
+"""Most steps of the lens of a cropped photo, each with a new pose; pixels of the last one that counts."""
 OTHER_UNIT = 1.5
 """Measured depth is scaled if it differs from that of the map's points by this factor: it has another unit."""
 
@@ -162,6 +162,8 @@ class _Search:
         self.placed: dict[int, np.ndarray] = {}
         self.links: dict[int, np.ndarray] = {}
         self.lenses: dict[int, Lens] = {}
+        self.cropped = set[int]()
+        self.changed: dict[int, np.ndarray] = {}
         self.why: dict[int, str] = {}
         self.dropped = Counter[int]()
 
@@ -200,18 +202,21 @@ class _Search:
         return found
 
     def _refine_lenses(self, found: Adjustment) -> bool:
-        """A step of each lens that may be of a cropped photo and is of that photo alone; whether one changed much."""
+        """A step of the lenses of cropped photos; whether one changed much. On a flat thing features leave so much of a
+        lens open that it stays as matches told it first, if they did not tell of another centre."""
         lenses, count = [view_lens(view) for view in self.views], len(self.reference.views)
-        poses, most = dict(self.placed), 0.0
+        poses, changed, most = dict(self.placed), dict(self.changed), 0.0
         for number, errors in self._lens_errors().items():
-            if errors[0] == OTHER[0] and lenses.count(lenses[number]) == 1:
-                step, turn = found.lens_step(number, *errors)
+            if number in self.cropped:
+                before = self.changed.get(number, np.zeros(3))
+                step, turn = found.lens_step(number, *errors, before)
+                changed[number] = before + step
                 lenses[number] = moved(lenses[number], *step)
                 poses[number] = found.poses.at(count + number).turned(turn[None]).matrices()[0]
                 most = max(most, *abs(step * (max(self.views[number].photo_size), 1, 1)))
         if most < LENS_STEP:
             return False
-        self.placed = poses
+        self.placed, self.changed = poses, changed
         self._see(lenses)
         return True
 
@@ -235,6 +240,7 @@ class _Search:
                 own[number] = self.lenses[number]
             else:
                 shared.setdefault(lenses[number], []).append(self.lenses[number])
+        self.cropped = set(own)
         chosen = {lens: median(found) for lens, found in shared.items()}
         if not own and all(lens == found for lens, found in chosen.items()):
             return

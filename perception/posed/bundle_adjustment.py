@@ -150,13 +150,13 @@ class Adjusted:
         found[unknown] += moved @ np.linalg.solve(schur, np.swapaxes(moved, 1, 2))
         return found
 
-    def lens_step(self, number: int, focal: float, centre: float) -> tuple[np.ndarray, np.ndarray]:
+    def lens_step(self, number: int, focal: float, centre: float, changed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """[3]: what a step of Gauss-Newton adds to the logarithm of the focal length and to the principal point of the
         pose `number` of those that are not held, as its features tell; [6]: to that pose, as `Poses.turned` takes it.
-        focal, centre: as of `covariances`; no step is longer."""
+        focal, centre: as of `covariances`, of the lens before it was `changed` [3]; no step is longer."""
         V_inverse = _normal(self._problem, self.poses, self.points, 0.0)[2]
         moved, schur, right = self._by_lens(V_inverse, np.array([number]), np.array([[focal, centre]]))
-        step = np.linalg.solve(schur[0], right[0])
+        step = np.linalg.solve(schur[0], right[0] - changed / np.square((focal, centre, centre)))
         step = step / max(1.0, *abs(step / (focal, centre, centre)))
         return step, -moved[0] @ step
 

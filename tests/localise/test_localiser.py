@@ -74,7 +74,7 @@ def test_a_photo_beside_the_map_is_reached_through_others(
     """The map shows two walls. A turn on the spot would give no points in space, so the camera moves.
     The errors are computed once, of the last of several adjustments."""
     covariances, calls = Adjusted.covariances, list[Adjusted]()
-    monkeypatch.setattr(Adjusted, "covariances", lambda found: (calls.append(found), covariances(found))[1])
+    monkeypatch.setattr(Adjusted, "covariances", lambda found, lens: (calls.append(found), covariances(found, lens))[1])
     targets = [(3.4, 3.0), (2.0, 3.0), (0.6, 3.0), (0.0, 2.2), (0.0, 1.4), (0.0, 0.8)]
     poses = [pose_at((2.2 + 0.12 * n, 1.0 + 0.1 * (-1) ** n, 1.2), (x, y, 1.2)) for n, (x, y) in enumerate(targets)]
     photos = new(room, tmp_path, poses)

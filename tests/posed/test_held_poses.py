@@ -123,12 +123,13 @@ def test_steps_of_a_wrong_lens_find_the_true_one() -> None:
     poses, _, tracks = made()
     last, pixels = tracks.view == VIEWS - 1, tracks.rays * FOCAL
     focal, centre, begun = 1.1 * FOCAL, np.array([20.0, -15.0]), start(poses)
+    changed = np.zeros(3)
     for _ in range(6):
         rays = np.where(last[:, None], (pixels - centre) / focal, tracks.rays)
         seen = replace(tracks, rays=rays, focal=np.where(last, focal, FOCAL))
         found = adjust(seen, begun, begun, (0.1, 0.4), HELD)
-        step, turn = found.lens_step(0, 0.3, 60.0)
-        focal, centre = focal * np.exp(step[0]), centre + step[1:]
+        step, turn = found.lens_step(0, 0.3, 60.0, changed)
+        focal, centre, changed = focal * np.exp(step[0]), centre + step[1:], changed + step
         begun = found.poses.turned(np.outer(~HELD, turn))
     assert focal == pytest.approx(FOCAL, rel=1e-3) and np.abs(centre).max() < 0.2
     assert np.abs(found.poses.center[-1] - poses.center[-1]).max() < 1e-3
