@@ -13,7 +13,7 @@ from perception.inputs.colmap_files import Model, names_in, read_model
 from perception.io.documents import safe_name
 from perception.photos.folder import NO_PHOTOS, folders_below, list_photos
 from perception.photos.lens import lens_from_camera
-from perception.photos.named_files import NamedFiles, leads_out, parts_of
+from perception.photos.named_files import NamedFiles, below, parts_of
 from perception.photos.views import first_of, without_far
 from perception.posed.triangulate import MIN_POINTS, posed_scene
 from perception.sfm.model import cloud_of, views_of_model
@@ -73,9 +73,9 @@ def photo_folder(folder: Path, model: Path, names: Sequence[str]) -> Path:
     inside = model.relative_to(folder).parts
     usual = _PHOTOS[::-1] if _DISTORTED in inside else _PHOTOS
     near = [folder.joinpath(*inside[:depth], name) for depth in range(len(inside), -1, -1) for name in usual]
-    below = sorted(folders_below(folder, DEPTH - 1), key=lambda path: bool(NO_PHOTOS.search(path.name)))
+    deeper = sorted(folders_below(folder, DEPTH - 1), key=lambda path: bool(NO_PHOTOS.search(path.name)))
     best, most = folder / usual[0], 0
-    for path in [*near, folder, *below]:
+    for path in [*near, folder, *deeper]:
         files = NamedFiles(path, beyond=False)
         held = sum(files.find(name) is not None for name in names) if path.is_dir() else 0
         if held > most:
@@ -165,7 +165,7 @@ def _preferred(folder: Path) -> list[Path]:
 def _located(folder: Path, model: Model) -> tuple[dict[int, tuple[str, Path]], list[dict[str, str]]]:
     """View name and photo by image id, and the images that are wrong."""
     written = {number: model.names[number] for number in model.reconstruction.reg_image_ids()}
-    names = {number: safe_name(_below(name), model.path) for number, name in written.items()}
+    names = {number: safe_name(below(name), model.path) for number, name in written.items()}
     root = photo_folder(folder, model.path, list(written.values()))
     files, located, taken = NamedFiles(root, beyond=False), {}, set[Path]()
     for image_id, name in sorted(names.items(), key=lambda item: (not (root / item[1]).is_file(), item[0])):
@@ -180,12 +180,6 @@ def _located(folder: Path, model: Model) -> tuple[dict[int, tuple[str, Path]], l
         {"name": located.pop(number)[0], "why": why} for number, why in sorted(model.wrong.items()) if number in located
     ]
     return located, wrong
-
-
-def _below(name: str) -> str:
-    """A name as below its folder: of an absolute path, or one with "..", its folders and its file."""
-    parts = parts_of(name)[":" in name[1:2] :]
-    return "/".join(part for part in parts if part != "..") if leads_out(name) else name
 
 
 def _reprojection_error(model: Any) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,13 +39,21 @@ class Adjustment:
         takes the cube of their number. lens: as `Adjusted.covariances`, of the photos whose lens is not known."""
         if self._found is None:
             return {}
-        errors = np.array([lens.get(number, (0.0, 0.0)) for number in self.inliers])
-        return dict(zip(self.inliers, self._found.covariances(errors), strict=True))
+        return dict(zip(self.inliers, self._found.covariances(self._rows(lens, 2)), strict=True))
 
-    def lens_step(self, number: int, focal: float, centre: float, changed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of a placed photo: see `Adjusted.lens_step`."""
-        assert self._found is not None
-        return self._found.lens_step(list(self.inliers).index(number), focal, centre, changed)
+    def lens_steps(
+        self, lens: dict[int, tuple[float, float]], changed: dict[int, np.ndarray]
+    ) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+        """Of the photos in `lens`, by number: see `Adjusted.lens_steps`."""
+        if self._found is None or not lens:
+            return {}
+        found = self._found.lens_steps(self._rows(lens, 2), self._rows(changed, 3))
+        both = dict(zip(self.inliers, zip(*found, strict=True), strict=True))
+        return {number: both[number] for number in lens}
+
+    def _rows(self, values: Mapping[int, Sequence[float] | np.ndarray], width: int) -> np.ndarray:
+        """[K, width] of the adjusted photos, 0 where there is no value."""
+        return np.array([values.get(number, (0.0,) * width) for number in self.inliers])
 
 
 def joined(reference: Reference, new: Features, pairs: np.ndarray) -> Features:

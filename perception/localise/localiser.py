@@ -206,14 +206,12 @@ class _Search:
         lens open that it stays as matches told it first, if they did not tell of another centre."""
         lenses, count = [view_lens(view) for view in self.views], len(self.reference.views)
         poses, changed, most = dict(self.placed), dict(self.changed), 0.0
-        for number, errors in self._lens_errors().items():
-            if number in self.cropped:
-                before = self.changed.get(number, np.zeros(3))
-                step, turn = found.lens_step(number, *errors, before)
-                changed[number] = before + step
-                lenses[number] = moved(lenses[number], *step)
-                poses[number] = found.poses.at(count + number).turned(turn[None]).matrices()[0]
-                most = max(most, *abs(step * (max(self.views[number].photo_size), 1, 1)))
+        errors = {number: error for number, error in self._lens_errors().items() if number in self.cropped}
+        for number, (step, turn) in found.lens_steps(errors, self.changed).items():
+            changed[number] = self.changed.get(number, np.zeros(3)) + step
+            lenses[number] = moved(lenses[number], *step)
+            poses[number] = found.poses.at(count + number).turned(turn[None]).matrices()[0]
+            most = max(most, *abs(step * (max(self.views[number].photo_size), 1, 1)))
         if most < LENS_STEP:
             return False
         self.placed, self.changed = poses, changed

@@ -31,6 +31,12 @@ def leads_out(name: str) -> bool:
     return bool(_ABSOLUTE.match(name)) or ".." in parts_of(name)
 
 
+def below(name: str) -> str:
+    """A name as below its folder: of one that leads out its folders and its file, without a drive and ".."."""
+    parts = parts_of(name)[":" in name[1:2] :]
+    return "/".join(part for part in parts if part != "..") if leads_out(name) else name
+
+
 class NamedFiles:
     """The files below `folder`, by the names that lists give them. Each folder is listed once.
     beyond: whether an absolute path, or one with "..", may lead to a file elsewhere."""
@@ -43,13 +49,11 @@ class NamedFiles:
         """The file `name` as it is written, else with "\\" as "/", else the only one that differs by capitals or by the
         form of Unicode; with each of `suffixes` where it has none. Of an absolute path that leads nowhere, and of what
         may not lead elsewhere, the longest end that is a file below the folder. None without a file."""
-        endings, parts = ("", *suffixes), parts_of(name)
         outside = not self.beyond and leads_out(name)
+        endings, parts = ("", *suffixes), parts_of(below(name) if outside else name)
         for path in (self.folder / f"{name}{end}" for end in endings if not outside):
             if os.path.isfile(path):  # noqa: PTH113 - Path.is_file raises for a name that is too long
                 return path
-        if outside:
-            parts = [part for part in parts if part != ".."]
         starts = range(len(parts)) if outside or _ABSOLUTE.match(name) else range(min(1, len(parts)))
         return next(filter(None, (self._below(parts[start:], endings) for start in starts)), None)
 

@@ -146,19 +146,23 @@ class Adjusted:
         inverse = np.linalg.inv(reduced[free][:, free].toarray()).reshape(count, 6, count, 6)
         found = np.asarray(inverse[np.arange(count), :, np.arange(count)])
         unknown = np.flatnonzero(lens.all(axis=1))
-        moved, schur, _ = self._by_lens(V_inverse, unknown, lens[unknown])
-        found[unknown] += moved @ np.linalg.solve(schur, np.swapaxes(moved, 1, 2))
+        if len(unknown):
+            moved, schur, _ = self._by_lens(V_inverse, unknown, lens[unknown])
+            found[unknown] += moved @ np.linalg.solve(schur, np.swapaxes(moved, 1, 2))
         return found
 
-    def lens_step(self, number: int, focal: float, centre: float, changed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """[3]: what a step of Gauss-Newton adds to the logarithm of the focal length and to the principal point of the
-        pose `number` of those that are not held, as its features tell; [6]: to that pose, as `Poses.turned` takes it.
-        focal, centre: as of `covariances`, of the lens before it was `changed` [3]; no step is longer."""
+    def lens_steps(self, lens: np.ndarray, changed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What a step of Gauss-Newton adds, as features tell: [K, 3] to the logarithm of each focal length and to the
+        principal point, [K, 6] to the pose, as `Poses.turned` takes it. lens: as of `covariances`, of the lenses before
+        they were `changed` [K, 3]; no step is longer."""
+        steps, turns, unknown = np.zeros((len(lens), 3)), np.zeros((len(lens), 6)), np.flatnonzero(lens.all(axis=1))
         V_inverse = _normal(self._problem, self.poses, self.points, 0.0)[2]
-        moved, schur, right = self._by_lens(V_inverse, np.array([number]), np.array([[focal, centre]]))
-        step = np.linalg.solve(schur[0], right[0] - changed / np.square((focal, centre, centre)))
-        step = step / max(1.0, *abs(step / (focal, centre, centre)))
-        return step, -moved[0] @ step
+        moved, schur, right = self._by_lens(V_inverse, unknown, lens[unknown])
+        errors = lens[unknown][:, [0, 1, 1]]
+        some = np.linalg.solve(schur, (right - changed[unknown] / errors**2)[..., None])[..., 0]
+        some /= np.maximum(1.0, np.abs(some / errors).max(axis=1, keepdims=True))
+        steps[unknown], turns[unknown] = some, -np.einsum("lpk,lk->lp", moved, some)
+        return steps, turns
 
     def _by_lens(
         self, V_inverse: np.ndarray, numbers: np.ndarray, lens: np.ndarray
@@ -167,12 +171,13 @@ class Adjusted:
         normal matrix [L, 3, 3] and the right side [L, 3]."""
         problem, tracks = self._problem, self._problem.tracks
         views = np.flatnonzero(~problem.held)[numbers]
-        residual, J_pose, J_point = _linearised(problem, self.poses, self.points)
-        J = np.concatenate([J_pose, _lens_jacobian(problem, self.poses, self.points)], axis=2)
-        W = np.einsum("orv,orw->ovw", J, J_point)
-        each = np.einsum("orv,orw->ovw", J, J) - W @ V_inverse[tracks.point] @ np.swapaxes(W, 1, 2)
-        S = sums_by(tracks.view, each, len(self.poses.center))[views]
-        g = -sums_by(tracks.view, np.einsum("orv,or->ov", J, residual), len(self.poses.center))[views]
+        rows = np.isin(tracks.view, views)
+        residual, J_pose, J_point = (part[rows] for part in _linearised(problem, self.poses, self.points))
+        J = np.concatenate([J_pose, _lens_jacobian(problem, self.poses, self.points)[rows]], axis=2)
+        W, view, count = np.einsum("orv,orw->ovw", J, J_point), tracks.view[rows], len(self.poses.center)
+        each = np.einsum("orv,orw->ovw", J, J) - W @ V_inverse[tracks.point[rows]] @ np.swapaxes(W, 1, 2)
+        S = sums_by(view, each, count)[views]
+        g = -sums_by(view, np.einsum("orv,or->ov", J, residual), count)[views]
         A, B, C = S[:, :6, :6], S[:, :6, 6:], S[:, 6:, 6:]
         C = C + np.eye(3) / np.square(lens[:, [0, 1, 1]])[:, None]
         moved = np.linalg.solve(A, B)

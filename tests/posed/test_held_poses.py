@@ -128,7 +128,7 @@ def test_steps_of_a_wrong_lens_find_the_true_one() -> None:
         rays = np.where(last[:, None], (pixels - centre) / focal, tracks.rays)
         seen = replace(tracks, rays=rays, focal=np.where(last, focal, FOCAL))
         found = adjust(seen, begun, begun, (0.1, 0.4), HELD)
-        step, turn = found.lens_step(0, 0.3, 60.0, changed)
+        (step,), (turn,) = found.lens_steps(np.array([[0.3, 60.0]]), changed[None])
         focal, centre, changed = focal * np.exp(step[0]), centre + step[1:], changed + step
         begun = found.poses.turned(np.outer(~HELD, turn))
     assert focal == pytest.approx(FOCAL, rel=1e-3) and np.abs(centre).max() < 0.2
